@@ -1,0 +1,65 @@
+"""Standardisation with moments learned from the data seen so far."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+_LEAST_VARIANCE = 1e-8
+
+
+class RunningNormalizer(nn.Module):
+    """Standardises vectors by the mean and variance of all batches it was updated with.
+
+    The moments are buffers, hence saved with the weights; float64, because a running sum over
+    millions of samples outgrows float32. Before the first update nothing but the clip acts.
+
+    Args:
+        size: Length n of the vectors.
+        clip: Largest absolute value that comes out.
+
+    Attributes:
+        mean: (n,) float64.
+        variance: (n,) float64, of the population (divided by the count).
+        count: () float64, vectors seen.
+    """
+
+    mean: torch.Tensor
+    variance: torch.Tensor
+    count: torch.Tensor
+
+    def __init__(self, size: int, clip: float = 5.0) -> None:
+        super().__init__()
+        self.clip = clip
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("variance", torch.ones(size, dtype=torch.float64))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+
+    @torch.no_grad()
+    def update(self, batch: torch.Tensor) -> None:
+        """Merges the moments of a batch (B, n) into the running ones; an empty one changes nothing.
+
+        Source: Chan, Golub & LeVeque 1979, "Updating formulae and a pairwise algorithm for
+        computing sample variances".
+        """
+        added = len(batch)
+        if added == 0:
+            return
+        values = batch.to(torch.float64)
+        total = self.count + added
+        delta = values.mean(0) - self.mean
+        # M_ab = M_a + M_b + delta^2 n_a n_b / n, with M the sum of squared deviations
+        squares = (
+            self.variance * self.count
+            + values.var(0, correction=0) * added
+            + delta**2 * self.count * added / total
+        )
+        self.mean += delta * added / total
+        self.variance.copy_(squares / total)
+        self.count.copy_(total)
+
+    def forward(self, values: torch.Tensor) -> torch.Tensor:
+        """(B, n) -> standardised, clipped to +-clip, (B, n) float32; changes no moment."""
+        deviation = (self.variance + _LEAST_VARIANCE).sqrt()
+        standard = (values.to(torch.float64) - self.mean) / deviation
+        return standard.clamp(-self.clip, self.clip).to(torch.float32)

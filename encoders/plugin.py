@@ -1,0 +1,22 @@
+"""The encoders that come with ventosa, registered as any plugin's would be."""
+
+from __future__ import annotations
+
+from encoders.conv import Conv, Paper
+from encoders.ml_agents import FullyConnected, NatureCnn, ResNet, Simple
+from encoders.vector import Vector
+from trainers.hookspecs import hookimpl
+
+
+@hookimpl
+def ventosa_encoders() -> dict[str, type]:
+    """Encoders by the name a run file uses."""
+    return {
+        "conv": Conv,
+        "paper": Paper,
+        "simple": Simple,
+        "nature_cnn": NatureCnn,
+        "resnet": ResNet,
+        "fully_connected": FullyConnected,
+        "vector": Vector,
+    }
