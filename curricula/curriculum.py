@@ -1,0 +1,68 @@
+"""The contract of a curriculum: pure functions of a state that fits in JSON."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from curricula.samplers import ParameterValue
+
+State = dict[str, Any]
+"""Everything that a curriculum remembers, made of what JSON knows."""
+
+
+@dataclass(frozen=True)
+class FinishedEpisodes:
+    """The episodes that ended since the curriculum was last asked to advance.
+
+    Attributes:
+        rewards: (k,) cumulative reward of each, in the order in which they ended.
+        successes: (k,) whether each ended in success.
+        progress: Training steps done over the run's ``max_steps``, in [0, 1].
+
+    Raises:
+        ValueError: The arrays are not (k,) both, or a reward is not finite.
+    """
+
+    rewards: NDArray[np.floating]
+    successes: NDArray[np.bool_]
+    progress: float
+
+    def __post_init__(self) -> None:
+        if self.rewards.ndim != 1 or self.rewards.shape != self.successes.shape:
+            raise ValueError(
+                "rewards and successes must have one value per episode, not the shapes "
+                f"{self.rewards.shape} and {self.successes.shape}"
+            )
+        if not np.isfinite(self.rewards).all():
+            raise ValueError("the cumulative reward of an episode is not a finite number")
+
+
+class Curriculum(Protocol):
+    """Chooses the environment's parameters from how the training goes.
+
+    A curriculum keeps nothing in itself: the state goes into the checkpoint, and a run that reads
+    it back goes on exactly.
+    """
+
+    @property
+    def lesson_count(self) -> int:
+        """How many lessons there are."""
+        ...
+
+    def initial_state(self) -> State:
+        """Return the state at the start of a run."""
+        ...
+
+    def advance(self, state: State, episodes: FinishedEpisodes) -> State:
+        """Return the state after some episodes; ``state`` itself is left as it is."""
+        ...
+
+    def lesson(self, state: State) -> int:
+        """Return the index of the current lesson, from 0."""
+        ...
+
+    def parameters(self, state: State) -> dict[str, ParameterValue]:
+        """Return the environment parameters of the current lesson: numbers or samplers."""
+        ...

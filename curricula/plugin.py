@@ -1,0 +1,10 @@
+"""The curricula that ventosa brings along."""
+
+from curricula.lessons import Lessons
+from trainers.hookspecs import hookimpl
+
+
+@hookimpl
+def ventosa_curricula() -> dict[str, type]:
+    """Return the built-in curricula by name."""
+    return {"lessons": Lessons}

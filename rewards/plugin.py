@@ -1,0 +1,19 @@
+"""The rewards that ventosa brings along."""
+
+from rewards.events import Collision, Position, Rotation, Sparse, Touch
+from rewards.shaping import Approach, Facing
+from trainers.hookspecs import hookimpl
+
+
+@hookimpl
+def ventosa_rewards() -> dict[str, type]:
+    """Return the built-in rewards by name."""
+    return {
+        "touch": Touch,
+        "collision": Collision,
+        "position": Position,
+        "rotation": Rotation,
+        "approach": Approach,
+        "facing": Facing,
+        "sparse": Sparse,
+    }
