@@ -1,0 +1,63 @@
+"""Files that are either there in full or not there at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Let every OSError of the block name `path`.
+
+    The operating system's own errors (a full disk, say) often name no file at all, or a temporary
+    one that means nothing to the user.
+
+    Raises:
+        OSError: of the same kind as the original one, with `path` as its file name.
+    """
+    try:
+        yield
+    except OSError as error:
+        reason = f"cannot write: {error.strerror or error}"
+        raise OSError(error.errno, reason, str(path)) from error
+
+
+def sync(path: Path) -> None:
+    """Wait until a file's content, or a directory's list of names, is on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_atomically(path: Path, data: bytes | str) -> None:
+    """Write a file so that a reader, or a crash, sees the old content or the new, never a part.
+
+    The data go into a hidden file beside `path`, which is fsynced and then renamed. One process
+    at a time may write the same path.
+
+    Args:
+        path: the file to write; its directory must exist.
+        data: the whole content; text is written as UTF-8.
+
+    Raises:
+        OSError: naming `path`; what was there before is untouched.
+    """
+    content = data.encode() if isinstance(data, str) else data
+    # Always the same name: what an interrupted write left behind is overwritten by the next one.
+    temporary = path.with_name(f".{path.name}.tmp")
+    with naming(path):
+        try:
+            with temporary.open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+        sync(path.parent)

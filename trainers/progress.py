@@ -1,0 +1,207 @@
+"""What a user sees while a run goes on: a live panel on a terminal, plain lines anywhere else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Protocol, Self
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.panel import Panel
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+_UNKNOWN = "?"
+_LONGEST_TITLE = 50
+_WIDEST_PANEL = 100
+
+
+@dataclass(frozen=True)
+class ProgressLine:
+    """Where a run stands.
+
+    Attributes:
+        step: environment steps taken.
+        reward: mean return of the last episodes; None before any has ended.
+        lesson: index of the current lesson, from 0 (shown from 1).
+        success: share of successful episodes, 0 to 1; None before any has ended.
+        steps_per_second: current speed, environment steps per second of wall clock.
+        seconds_left: estimate for the rest of the run; None where there is none yet.
+    """
+
+    step: int
+    reward: float | None = None
+    lesson: int = 0
+    success: float | None = None
+    steps_per_second: float | None = None
+    seconds_left: float | None = None
+
+
+class Progress(Protocol):
+    """Shows a run's progress; used as a context manager around the run."""
+
+    def update(self, line: ProgressLine) -> None:
+        """Show where the run stands."""
+
+    def message(self, text: str) -> None:
+        """Show a line of text that stays; it is printed as it is, without markup."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None: ...
+
+
+def make_progress(
+    run_id: str,
+    max_steps: int,
+    lesson_count: int,
+    start_step: int = 0,
+    console: Console | None = None,
+) -> Progress:
+    """Choose the display that fits the console.
+
+    Args:
+        run_id: the run's name, shown as the title.
+        max_steps: environment steps at which the run ends.
+        lesson_count: lessons of the curriculum; with 1 or less no lesson is shown.
+        start_step: the step at which the run starts or goes on.
+        console: where to show it; standard output by default.
+    """
+    console = console or Console()
+    live = console.is_terminal and not console.is_dumb_terminal
+    display = _LiveProgress if live else _PlainProgress
+    return display(console, run_id, max_steps, lesson_count, start_step)
+
+
+def format_count(number: float) -> str:
+    """A number with three significant digits: `999`, `12.3k`, `5M`."""
+    for unit in ("", "k", "M", "G"):
+        digits = max(0, 2 - math.floor(math.log10(max(abs(number), 1))))
+        rounded = round(number, digits)
+        if abs(rounded) < 1000 or unit == "G":
+            break
+        number /= 1000
+    text = f"{rounded:.{digits}f}"
+    return (text.rstrip("0").rstrip(".") if "." in text else text) + unit
+
+
+def format_duration(duration_s: float) -> str:
+    """A duration in seconds as its two largest units: `42 s`, `4 min 12 s`, `3 h 5 min`."""
+    seconds = round(duration_s)
+    minutes, hours, days = seconds // 60, seconds // 3600, seconds // 86400
+    if days:
+        return f"{days} d {hours % 24} h"
+    if hours:
+        return f"{hours} h {minutes % 60} min"
+    if minutes:
+        return f"{minutes} min {seconds % 60} s"
+    return f"{seconds} s"
+
+
+class _Display:
+    """What both displays have in common."""
+
+    def __init__(
+        self, console: Console, run_id: str, max_steps: int, lesson_count: int, start_step: int
+    ) -> None:
+        self._console = console
+        self._run_id = run_id
+        self._max_steps = max_steps
+        self._lesson_count = lesson_count
+        self._start_step = start_step
+
+    def message(self, text: str) -> None:
+        """Print a line that stays."""
+        self._console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
+
+    def _figures(self, line: ProgressLine) -> list[str]:
+        lesson = (
+            [f"lesson {line.lesson + 1}/{self._lesson_count}"] if self._lesson_count > 1 else []
+        )
+        return [
+            f"reward {_if_known(line.reward, lambda reward: f'{reward:.3f}')}",
+            *lesson,
+            f"success {_if_known(line.success, lambda share: f'{share:.0%}')}",
+            f"{_if_known(line.steps_per_second, format_count)} steps/s",
+        ]
+
+
+class _PlainProgress(_Display):
+    """One line per update, for logs, pipes and terminals that can't do more."""
+
+    def __enter__(self) -> Self:
+        start = f" from step {format_count(self._start_step)}" if self._start_step else ""
+        self.message(f"{self._run_id}:{start} to step {format_count(self._max_steps)}")
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        pass
+
+    def update(self, line: ProgressLine) -> None:
+        """Print one line."""
+        position = f"{format_count(line.step)}/{format_count(self._max_steps)}"
+        left = f"{_if_known(line.seconds_left, format_duration)} left"
+        self.message("  ".join([position, *self._figures(line), left]))
+
+
+class _LiveProgress(_Display):
+    """A panel that stays at the foot of the terminal; messages scroll by above it."""
+
+    def __init__(
+        self, console: Console, run_id: str, max_steps: int, lesson_count: int, start_step: int
+    ) -> None:
+        super().__init__(console, run_id, max_steps, lesson_count, start_step)
+        first = self._panel(ProgressLine(step=start_step))
+        self._live = Live(first, console=console, auto_refresh=False)
+
+    def __enter__(self) -> Self:
+        self._live.start(refresh=True)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._live.stop()
+
+    def update(self, line: ProgressLine) -> None:
+        """Redraw the panel."""
+        self._live.update(self._panel(line), refresh=True)
+
+    def _panel(self, line: ProgressLine) -> Panel:
+        position = f"{format_count(line.step)} / {format_count(self._max_steps)}"
+        # A run may overshoot by part of its last batch.
+        share = min(1.0, line.step / max(1, self._max_steps))
+        left = f"{_if_known(line.seconds_left, format_duration)} left"
+        bar = Table.grid(padding=(0, 2, 0, 0), expand=True)
+        bar.add_column(no_wrap=True)
+        bar.add_column(ratio=1)
+        bar.add_column(no_wrap=True)
+        bar.add_column(no_wrap=True)
+        bar.add_row(position, ProgressBar(total=1.0, completed=share), f"{share:.0%}", left)
+        figures = Text("   ".join(self._figures(line)), no_wrap=True, overflow="ellipsis")
+        # Text, not str: a run id may hold what rich would take for markup.
+        title = Text(self._run_id, style="bold")
+        title.truncate(_LONGEST_TITLE, overflow="ellipsis")
+        width = min(self._console.width, _WIDEST_PANEL)
+        return Panel(Group(bar, figures), title=title, title_align="left", width=width)
+
+
+def _if_known(value: float | None, form: Callable[[float], str]) -> str:
+    return _UNKNOWN if value is None or not math.isfinite(value) else form(value)
