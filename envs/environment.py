@@ -1,0 +1,70 @@
+"""The contract of an environment: a batch of environments that training can steer and resume."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from curricula.samplers import ParameterValue
+from rewards.reward import RewardTerm
+
+Observations = dict[str, NDArray[Any]]
+
+
+class EnvironmentFailure(RuntimeError):  # noqa: N818 - gymnasium's Error says something else
+    """An environment broke down, through no fault of the run file: a process died, for instance."""
+
+
+class Environment(VectorEnv[Observations, NDArray[Any], NDArray[np.float64]]):
+    """N environments stepped together, with dictionaries of observations.
+
+    It resets an environment in the step its episode ends in (`AutoresetMode.SAME_STEP`). The
+    `infos` of a step may hold, next to gymnasium's own keys:
+
+    - `final_obs`: observations (N, ...) before the reset, right where `_final_obs` (N,) is set.
+    - `same_frame` (N,): the images of the observation are those of the step before, so that they
+      need be neither stored nor encoded again.
+    - `reward_terms`: the weighted rewards (N,) by name.
+    - `measures`: by name, what to report of an episode (N,), read where it ends. `success` among
+      them is the success rate.
+
+    Built as `cls(settings, rewards, seed)`.
+
+    Attributes:
+        Settings: the model of the run file's `environment` section.
+        parameter_names: the environment parameters that curricula and samplers may set.
+    """
+
+    Settings: ClassVar[type[BaseModel]]
+    parameter_names: ClassVar[frozenset[str]] = frozenset()
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    @abstractmethod
+    def __init__(self, settings: BaseModel, rewards: Sequence[RewardTerm], seed: int):
+        """Builds N environments.
+
+        Raises:
+            ValueError: the settings don't fit together, or the rewards don't apply here.
+        """
+
+    def set_parameters(self, parameters: Mapping[str, ParameterValue]) -> None:
+        """Sets environment parameters; they hold from each environment's next reset on."""
+        if unknown := sorted(set(parameters) - self.parameter_names):
+            raise ValueError(
+                f"unknown environment parameters {unknown}; there are: "
+                f"{sorted(self.parameter_names) or 'none'}"
+            )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on exactly as from here: plain values and arrays."""
+        raise NotImplementedError
+
+    def load_state_dict(self, state: dict[str, Any]) -> Observations:
+        """Goes back to a state; returns the observations it was left with."""
+        raise NotImplementedError

@@ -1,0 +1,132 @@
+"""The pinhole camera and the depth sensor's model.
+
+Camera axes are OpenCV's: x to the right, y down, z forward; depth is measured along z. Pixel
+(column c, row r) looks along the ray through its centre, (c + 0.5, r + 0.5) from the top left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from encoders.spaces import DepthImage
+from envs.grasp.batch import Batch
+from envs.grasp.settings import Camera
+
+Floats = NDArray[np.float64]
+Frame = NDArray[np.floating] | NDArray[np.integer]
+
+
+@dataclass(frozen=True)
+class Views(Batch):
+    """Where n cameras of one kind stand.
+
+    Attributes:
+        camera: what they have in common.
+        position_m: (n, 3) optical centres, world frame.
+        rotation: (n, 3, 3) whose columns are the camera's axes in the world frame.
+        near_m, far_m: (n,) clip planes.
+        noise_sigma_m: (n,) sigma of a depth camera's noise.
+    """
+
+    camera: Camera
+    position_m: Floats
+    rotation: Floats
+    near_m: Floats
+    far_m: Floats
+    noise_sigma_m: Floats
+
+
+def focal_length_px(camera: Camera) -> float:
+    """Focal length in pixels, the same for both axes."""
+    return camera.width / 2.0 / float(np.tan(np.radians(camera.fov_deg) / 2.0))
+
+
+def look_at(position_m: Floats, target_m: Floats) -> Floats:
+    """Rotation (3, 3) of an upright camera at `position_m` that looks at `target_m`."""
+    forward = np.asarray(target_m, float) - position_m
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    if np.linalg.norm(right) < 1e-9:  # looking straight down or up: the image's right is -y
+        right = np.array([0.0, -1.0, 0.0])
+    right = right / np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+def small_rotation(angles_rad: Floats) -> Floats:
+    """Rotations (n, 3, 3) by angles (n, 3) about x, then y, then z."""
+    sine, cosine = np.sin(angles_rad), np.cos(angles_rad)
+    zero, one = np.zeros(len(angles_rad)), np.ones(len(angles_rad))
+
+    def matrix(*rows: list[Floats]) -> Floats:
+        return np.moveaxis(np.array(rows), -1, 0)
+
+    (sx, sy, sz), (cx, cy, cz) = sine.T, cosine.T
+    about_x = matrix([one, zero, zero], [zero, cx, -sx], [zero, sx, cx])
+    about_y = matrix([cy, zero, sy], [zero, one, zero], [-sy, zero, cy])
+    about_z = matrix([cz, -sz, zero], [sz, cz, zero], [zero, zero, one])
+    return about_z @ about_y @ about_x
+
+
+def sample_views(
+    camera: Camera, rng: np.random.Generator, n: int, position_m: float, rotation_deg: float
+) -> Views:
+    """Places n cameras, each coordinate moved by up to +-`position_m`, each axis by `rotation_deg`."""
+    nominal = np.array(camera.position_m)
+    jitter = np.radians(rng.uniform(-rotation_deg, rotation_deg, (n, 3)))
+    return Views(
+        camera,
+        nominal + rng.uniform(-position_m, position_m, (n, 3)),
+        look_at(nominal, np.array(camera.target_m)) @ small_rotation(jitter),
+        rng.uniform(*camera.near_m, n),
+        rng.uniform(*camera.far_m, n),
+        np.full(n, camera.noise_sigma_m),
+    )
+
+
+def project(views: Views, points_m: Floats) -> Floats:
+    """Pixel coordinates (n, k, 2) and depth of world points (n, k, 3), as (n, k, 3): u, v, z."""
+    camera = views.camera
+    local = (points_m - views.position_m[:, None]) @ views.rotation
+    focal = focal_length_px(camera)
+    depth = local[..., 2]
+    safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
+    u = camera.width / 2.0 + focal * local[..., 0] / safe
+    v = camera.height / 2.0 + focal * local[..., 1] / safe
+    return np.stack([u, v, depth], axis=-1)
+
+
+def in_view(views: Views, points_m: Floats) -> NDArray[np.bool_]:
+    """Whether all the points (n, k, 3) of an environment lie inside its image: (n,)."""
+    u, v, depth = np.moveaxis(project(views, points_m), -1, 0)
+    inside = (u >= 0) & (u <= views.camera.width) & (v >= 0) & (v <= views.camera.height)
+    return np.asarray((inside & (depth > 0)).all(axis=1))
+
+
+def sense_depth(
+    depth_m: NDArray[np.float32],
+    space: DepthImage,
+    noise_sigma_m: Floats,
+    seeds: NDArray[np.uint64],
+) -> Frame:
+    """The sensor's model: true depth -> Gaussian noise -> clamp -> encoding.
+
+    Args:
+        depth_m: (n, H, W) true depth, infinite where nothing is hit.
+        space: the observation space, which clamps and encodes.
+        noise_sigma_m: (n,) sigma of the noise.
+        seeds: (n,) of the noise, one for each picture, so that it does not matter which process
+            takes the picture, or when.
+
+    Returns:
+        (n, H, W, 1) in the space's type.
+    """
+    noisy = np.empty_like(depth_m)
+    for row, seed in enumerate(seeds):
+        rng = np.random.Generator(np.random.SFC64(int(seed)))
+        rng.standard_normal(out=noisy[row], dtype=np.float32)
+    noisy *= noise_sigma_m[:, None, None].astype(np.float32)
+    noisy += depth_m
+    return space.encode(noisy)

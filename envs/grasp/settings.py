@@ -1,0 +1,162 @@
+"""Settings of the grasp environment: everything TASK leaves to the run file, with its default."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, Field, model_validator
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    low, high = value
+    if low > high:
+        raise ValueError(f"a range goes from low to high, and {low} is above {high}")
+    return value
+
+
+Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
+Point = tuple[float, float, float]
+
+
+class Camera(BaseModel, frozen=True, extra="forbid"):
+    """A pinhole camera with square pixels, sampled at pixel centres."""
+
+    type: Literal["depth", "rgb"] = Field(description="What the camera measures.")
+    width: int = Field(80, ge=1, le=4096, description="Image width in pixels.")
+    height: int = Field(80, ge=1, le=4096, description="Image height in pixels.")
+    fov_deg: float = Field(
+        44.0, gt=1.0, lt=170.0, description="Horizontal field of view in degrees."
+    )
+    position_m: Point = Field((0.36, 0.25, 0.95), description="Optical centre, world frame.")
+    target_m: Point = Field((1.10, 0.0, 0.73), description="The point it looks at, world frame.")
+    near_m: Range = Field((0.05, 0.10), description="Near clip plane, drawn at every reset.")
+    far_m: Range = Field((2.5, 3.0), description="Far clip plane, drawn at every reset.")
+    range_m: Range = Field((0.4, 2.0), description="Depth only: the sensor's measuring range.")
+    noise_sigma_m: float = Field(
+        0.002, ge=0.0, le=1.0, description="Depth only: sigma of the Gaussian noise."
+    )
+    encoding: Literal["uint16", "uint8"] = Field(
+        "uint16", description="Depth only: uint16 millimetres, or uint8 over the range."
+    )
+
+    @model_validator(mode="after")
+    def _geometry_is_possible(self) -> Camera:
+        if self.position_m == self.target_m:
+            raise ValueError("position_m and target_m are the same point: the camera looks nowhere")
+        if self.near_m[0] <= 0.0 or self.near_m[1] >= self.far_m[0]:
+            raise ValueError(
+                f"near_m {list(self.near_m)} must be over 0 and lie before far_m {list(self.far_m)}"
+            )
+        if self.range_m[0] < 0.0 or self.range_m[0] == self.range_m[1]:
+            raise ValueError(f"range_m {list(self.range_m)} must be a non-empty, positive range")
+        if self.encoding == "uint16" and self.range_m[1] > 65.535:
+            raise ValueError(
+                f"range_m reaches {self.range_m[1]} m, over uint16's 65.535 m: lower it, or use "
+                "encoding: uint8"
+            )
+        return self
+
+
+class Workspace(BaseModel, frozen=True, extra="forbid"):
+    """What an action of -1 to 1 maps onto: the tooltip's position and the tool's yaw."""
+
+    x_m: Range = Field((0.82, 1.35), description="Tooltip x, forward from the robot's base.")
+    y_m: Range = Field((-0.45, 0.45), description="Tooltip y, to the left.")
+    z_m: Range = Field((0.60, 1.00), description="Tooltip z, up.")
+    yaw_deg: Range = Field((-40.0, 40.0), description="Yaw of the tool about the vertical.")
+
+
+class Support(BaseModel, frozen=True, extra="forbid"):
+    """The table's top, a box; what carries it is left out."""
+
+    x_m: Range = Field((0.88, 1.50), description="From the robot's side to the far side.")
+    y_m: Range = Field((-0.50, 0.50), description="From the right to the left side.")
+    top_m: float = Field(0.60, gt=0.0, description="Height of the upper side.")
+    thickness_m: float = Field(0.05, gt=0.0, description="From the lower to the upper side.")
+
+
+Shape = Literal["parallelepiped", "L", "U"]
+
+
+class Randomize(BaseModel, frozen=True, extra="forbid"):
+    """Ranges drawn from at every reset; a zero range is a fixed value."""
+
+    shapes: tuple[Shape, ...] = Field(
+        ("parallelepiped", "L", "U"), min_length=1, description="Shapes a block may have."
+    )
+    block_x_m: Range = Field((0.95, 1.32), description="Centre of a block's face, forward.")
+    block_y_m: Range = Field((-0.28, 0.28), description="Centre of a block's face, sideways.")
+    block_yaw_deg: Range = Field((-30.0, 30.0), description="Yaw of a block's face.")
+    block_size_m: Range = Field((0.12, 0.24), description="Width and height of a block's face.")
+    block_depth_m: Range = Field((0.08, 0.12), description="Depth of a block behind its face.")
+    camera_position_m: float = Field(
+        0.01, ge=0.0, le=0.5, description="Half range of each camera coordinate."
+    )
+    camera_rotation_deg: float = Field(
+        1.0, ge=0.0, le=45.0, description="Half range of each of the camera's three rotations."
+    )
+    light_azimuth_deg: Range = Field((-180.0, 180.0), description="RGB: where the light stands.")
+    light_elevation_deg: Range = Field((30.0, 80.0), description="RGB: the light's elevation.")
+    light_intensity: Range = Field((0.4, 0.9), description="RGB: diffuse share of the light.")
+
+
+class Goal(BaseModel, frozen=True, extra="forbid"):
+    """The goal region in the block frame; also the environment parameters lessons set."""
+
+    lateral_limit_m: float = Field(0.01, gt=0.0, description="Lateral x within +- this.")
+    vertical_limit_m: float = Field(0.01, gt=0.0, description="Vertical y within +- this.")
+    gap_min_m: float = Field(0.01, ge=0.0, description="Smallest gap z from cup to face.")
+    gap_limit_m: float = Field(0.02, gt=0.0, description="Largest gap z from cup to face.")
+    yaw_limit_deg: float = Field(2.0, gt=0.0, description="Yaw error within +- this.")
+
+    @model_validator(mode="after")
+    def _gap_is_a_range(self) -> Goal:
+        if self.gap_limit_m <= self.gap_min_m:
+            raise ValueError(
+                f"gap_limit_m {self.gap_limit_m} must be over gap_min_m {self.gap_min_m}"
+            )
+        return self
+
+
+class GraspSettings(BaseModel, frozen=True, extra="forbid"):
+    """The grasp task: a KUKA KR 16 brings its suction cup in front of the nearest block."""
+
+    simulator: Literal["pybullet"] = Field("pybullet", description="The engine underneath.")
+    num_envs: int = Field(64, ge=1, le=65536, description="Environments stepped together.")
+    workers: int | None = Field(
+        None, ge=0, le=1024, description="Worker processes; 0: in this one; null: one per core."
+    )
+    episode_steps: int = Field(10, ge=1, description="Actions before an episode is truncated.")
+    frame_grab: bool = Field(
+        True, description="Observe the image taken at reset for the whole episode, or a stream."
+    )
+    cameras: dict[str, Camera] = Field(
+        default_factory=lambda: {"depth": Camera(type="depth")},
+        min_length=1,
+        description="Cameras by the name of their observation.",
+    )
+    privileged: bool = Field(
+        False, description="Offer the observation `privileged` (true state), meant for a critic."
+    )
+    blocks: int = Field(3, ge=1, le=6, description="Blocks on the support.")
+    target_lead_m: float = Field(
+        0.05, ge=0.0, description="How much nearer to the robot the first block is."
+    )
+    grasp_point: Literal["largest_disc", "centroid"] = Field(
+        "largest_disc", description="Where to grasp a face."
+    )
+    motion_checks: int = Field(
+        4, ge=0, le=100, description="Intermediate poses of a motion checked for contact."
+    )
+    workspace: Workspace = Field(default_factory=Workspace, description="Range of the actions.")
+    support: Support = Field(default_factory=Support, description="The table.")
+    goal: Goal = Field(default_factory=Goal, description="Goal region unless a lesson sets it.")
+    randomize: Randomize = Field(
+        default_factory=Randomize, description="What is drawn at every reset."
+    )
+
+    @model_validator(mode="after")
+    def _names_are_free(self) -> GraspSettings:
+        if "privileged" in self.cameras:
+            raise ValueError("cameras: the name 'privileged' is taken by the observation of it")
+        return self

@@ -1,0 +1,75 @@
+"""What the task asks of a simulator: one interface, several engines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from encoders.spaces import DepthImage
+from envs.environment import EnvironmentFailure
+from envs.grasp.camera import Views
+from envs.grasp.scene import Scenes
+
+Indices = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Images = NDArray[np.float32] | NDArray[np.uint8]
+
+
+class SimulatorError(EnvironmentFailure):
+    """The engine stopped working."""
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """What was touched along n motions.
+
+    Attributes:
+        touched: (n,) the cup touched the target block.
+        collided: (n,) any link touched a block or the support, or the cup touched the support or
+            another block.
+    """
+
+    touched: NDArray[np.bool_]
+    collided: NDArray[np.bool_]
+
+
+class Simulator(Protocol):
+    """N worlds, each with the robot, the support and the blocks of one scene.
+
+    Every call names the n worlds it is about by `indices` (n,), rising and without repeats.
+    """
+
+    def load(self, indices: Indices, scenes: Scenes, joints_rad: Floats) -> None:
+        """Puts the blocks of n scenes in place and the robots' joints at (n, 6)."""
+
+    def move(self, indices: Indices, path_rad: Floats) -> Contacts:
+        """Moves n robots along joint poses (n, p, 6), and stays at the last one."""
+
+    def render(self, indices: Indices, views: Views) -> Images:
+        """Takes n pictures.
+
+        Returns:
+            Depth in metres, (n, H, W) float32, infinite where nothing lies before the far plane; or
+            RGB (n, H, W, 3) uint8, by the camera's type.
+        """
+
+    def sense(
+        self, indices: Indices, views: Views, space: DepthImage, seeds: NDArray[np.uint64]
+    ) -> NDArray[np.integer]:
+        """Takes n depth pictures as the sensor delivers them.
+
+        Args:
+            indices: the worlds (n,).
+            views: the depth cameras, with their noise.
+            space: clamps and encodes.
+            seeds: (n,) of each picture's noise, which depends on nothing else.
+
+        Returns:
+            (n, H, W, 1) in the space's type.
+        """
+
+    def close(self) -> None:
+        """Frees what the engine holds; calling it twice does no harm."""

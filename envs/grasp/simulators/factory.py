@@ -1,0 +1,24 @@
+"""Chooses the engine a run file asks for."""
+
+from __future__ import annotations
+
+import os
+
+from envs.grasp.settings import GraspSettings
+from envs.grasp.simulators.base import Simulator
+from envs.grasp.simulators.pybullet import PyBulletSimulator
+from envs.grasp.simulators.workers import ParallelSimulator
+
+# Fewer worlds a process than this, and the messages cost more than the second core gives.
+MIN_WORLDS_PER_WORKER = 4
+
+
+def make_simulator(settings: GraspSettings, num_worlds: int, window: bool = False) -> Simulator:
+    """Builds the simulator of a run; a window means no worker processes."""
+    workers = settings.workers
+    if workers is None:
+        workers = min(len(os.sched_getaffinity(0)), num_worlds // MIN_WORLDS_PER_WORKER)
+        workers = workers if workers > 1 else 0
+    if window or workers == 0:
+        return PyBulletSimulator(num_worlds, settings.support, window)
+    return ParallelSimulator(num_worlds, min(workers, num_worlds), settings.support)

@@ -1,0 +1,10 @@
+"""The environments that ventosa brings along."""
+
+from envs.grasp.vector_env import GraspVectorEnv
+from trainers.hookspecs import hookimpl
+
+
+@hookimpl
+def ventosa_environments() -> dict[str, type]:
+    """Return the built-in environments by name."""
+    return {"grasp": GraspVectorEnv}
