@@ -1,0 +1,198 @@
+"""Distributions over actions, as values.
+
+A distribution is what a policy returns: a frozen pair of tensors without hidden state, so that the
+old and the new one of an update can stand side by side. All sums over the dimensions of an action
+happen here; whoever uses a distribution sees one number per action.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+_LOG_2_PI = math.log(2 * math.pi)
+
+
+class Distribution(Protocol):
+    """What every distribution over actions can do; B is the number of rows."""
+
+    def sample(self, generator: torch.Generator | None = None) -> Tensor:
+        """Draw one action per row; no gradient flows through it.
+
+        Args:
+            generator: The source of randomness, on the distribution's device; None is torch's own.
+        """
+        ...
+
+    def mode(self) -> Tensor:
+        """Return the likeliest action of each row, shaped as `sample` shapes it."""
+        ...
+
+    def log_prob(self, actions: Tensor) -> Tensor:
+        """Return the log density (or log probability) of one action per row, (B,), in nats."""
+        ...
+
+    def entropy(self) -> Tensor:
+        """Return the (differential) entropy of each row, (B,), in nats."""
+        ...
+
+    def kl(self, other: Self) -> Tensor:
+        """Return KL(self || other) of each row, (B,), in nats."""
+        ...
+
+    def detach(self) -> Self:
+        """Return the same distribution, cut from the graph that computed it."""
+        ...
+
+    def __getitem__(self, rows: slice | Tensor) -> Self:
+        """Return the distribution of some rows: a slice, a mask (B,) or indices (M,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class DiagonalGaussian:
+    """Independent normal distributions, one per dimension of a continuous action.
+
+    Attributes:
+        mean: The means, (B, A).
+        log_std: The logarithms of the standard deviations: (B, A), or (A,) when all rows share
+            them.
+
+    Raises:
+        ValueError: `log_std` has another shape.
+    """
+
+    mean: Tensor
+    log_std: Tensor
+
+    def __post_init__(self) -> None:
+        if self.log_std.shape not in (self.mean.shape, self.mean.shape[-1:]):
+            raise ValueError(
+                f"log_std has shape {tuple(self.log_std.shape)}; with means of shape "
+                f"{tuple(self.mean.shape)} it must be that or {tuple(self.mean.shape[-1:])}"
+            )
+
+    def sample(self, generator: torch.Generator | None = None) -> Tensor:
+        """Draw one action per row, (B, A); no gradient flows through it.
+
+        Args:
+            generator: The source of randomness, on the distribution's device; None is torch's own.
+        """
+        with torch.no_grad():
+            noise = torch.randn(
+                self.mean.shape,
+                generator=generator,
+                dtype=self.mean.dtype,
+                device=self.mean.device,
+            )
+            return noise.mul_(self.log_std.exp()).add_(self.mean)
+
+    def mode(self) -> Tensor:
+        """Return the mean, (B, A)."""
+        return self.mean
+
+    def log_prob(self, actions: Tensor) -> Tensor:
+        """Return the log density of one action per row, (B,).
+
+        Args:
+            actions: (B, A).
+
+        Raises:
+            ValueError: `actions` has another shape than the means; broadcasting would silently
+                compare each action with every row.
+        """
+        if actions.shape != self.mean.shape:
+            raise ValueError(
+                f"actions have shape {tuple(actions.shape)}, the distribution's means "
+                f"{tuple(self.mean.shape)}; they must be the same"
+            )
+        # log p(a) = -1/2 sum_i ((a_i - mu_i) / sigma_i)^2 - sum_i log sigma_i - A/2 log 2 pi
+        deviation = (actions - self.mean) * torch.exp(-self.log_std)
+        log_scale = self.log_std.sum(-1) + 0.5 * _LOG_2_PI * self.mean.shape[-1]
+        return -0.5 * deviation.square().sum(-1) - log_scale
+
+    def entropy(self) -> Tensor:
+        """Return the differential entropy of each row, (B,); it may be negative."""
+        # H = sum_i log sigma_i + A/2 (1 + log 2 pi)
+        constant = 0.5 * (1 + _LOG_2_PI) * self.mean.shape[-1]
+        return (self.log_std.sum(-1) + constant).expand(self.mean.shape[0])
+
+    def kl(self, other: DiagonalGaussian) -> Tensor:
+        """Return KL(self || other) of each row, (B,)."""
+        # KL(p || q) = 1/2 sum_i (s_i - 1 - log s_i + ((mu_p - mu_q)_i / sigma_q,i)^2)
+        # with s = (sigma_p / sigma_q)^2; expm1 keeps s - 1 - log s exact for close distributions,
+        # where a trust region measures it.
+        log_ratio = 2 * (self.log_std - other.log_std)
+        spread = (torch.expm1(log_ratio) - log_ratio).sum(-1)
+        deviation = (self.mean - other.mean) * torch.exp(-other.log_std)
+        return 0.5 * (spread + deviation.square().sum(-1))
+
+    def detach(self) -> DiagonalGaussian:
+        """Return the same distribution, cut from the graph that computed it."""
+        return DiagonalGaussian(self.mean.detach(), self.log_std.detach())
+
+    def __getitem__(self, rows: slice | Tensor) -> DiagonalGaussian:
+        """Return the distribution of some rows: a slice, a mask (B,) or indices (M,)."""
+        shared = self.log_std.ndim < self.mean.ndim
+        return DiagonalGaussian(self.mean[rows], self.log_std if shared else self.log_std[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Categorical:
+    """A choice between K discrete actions.
+
+    Attributes:
+        logits: Finite unnormalized log probabilities, (B, K).
+    """
+
+    logits: Tensor
+
+    def sample(self, generator: torch.Generator | None = None) -> Tensor:
+        """Draw one action per row, (B,) int64.
+
+        Args:
+            generator: The source of randomness, on the distribution's device; None is torch's own.
+
+        Raises:
+            RuntimeError: A logit is not finite.
+        """
+        with torch.no_grad():
+            probabilities = F.softmax(self.logits, -1)
+            return torch.multinomial(probabilities, 1, generator=generator).squeeze(-1)
+
+    def mode(self) -> Tensor:
+        """Return the likeliest action of each row, (B,) int64."""
+        return self.logits.argmax(-1)
+
+    def log_prob(self, actions: Tensor) -> Tensor:
+        """Return the log probability of one action per row, (B,).
+
+        Args:
+            actions: (B,) int64.
+        """
+        # The cross entropy with a one-hot target: log-softmax and selection in one fused kernel.
+        return -F.cross_entropy(self.logits, actions, reduction="none")
+
+    def entropy(self) -> Tensor:
+        """Return the entropy of each row, (B,), from 0 to log K."""
+        log_p = F.log_softmax(self.logits, -1)
+        return -(log_p.exp() * log_p).sum(-1)
+
+    def kl(self, other: Categorical) -> Tensor:
+        """Return KL(self || other) of each row, (B,)."""
+        log_p = F.log_softmax(self.logits, -1)
+        log_q = F.log_softmax(other.logits, -1)
+        return (log_p.exp() * (log_p - log_q)).sum(-1)
+
+    def detach(self) -> Categorical:
+        """Return the same distribution, cut from the graph that computed it."""
+        return Categorical(self.logits.detach())
+
+    def __getitem__(self, rows: slice | Tensor) -> Categorical:
+        """Return the distribution of some rows: a slice, a mask (B,) or indices (M,)."""
+        return Categorical(self.logits[rows])

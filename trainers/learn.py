@@ -1,0 +1,117 @@
+"""The command line: `python -m trainers.learn config/run.yaml`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+DONE, FAILED, MISTAKE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
+PACKAGES = ("trainers", "envs", "encoders", "rewards", "curricula")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Trains as the run file says; returns the exit code."""
+    options = parse(arguments)
+    if shadowed := shadowed_packages():
+        print(f"error: {shadowed}", file=sys.stderr)
+        return MISTAKE
+    # Imported late, so that `--help` and a mistyped option answer at once.
+    from envs.environment import EnvironmentFailure  # noqa: PLC0415
+    from trainers.checkpoint import CheckpointError  # noqa: PLC0415
+    from trainers.interaction import NonFiniteError  # noqa: PLC0415
+    from trainers.plugins import PluginError  # noqa: PLC0415
+    from trainers.run import run_file  # noqa: PLC0415
+    from trainers.settings import SettingsError  # noqa: PLC0415
+
+    with stop_on_signals() as stop:
+        try:
+            finished = run_file(options, stop.requested)
+        except (SettingsError, PluginError, CheckpointError) as mistake:
+            print(f"error: {mistake}", file=sys.stderr)
+            return MISTAKE
+        except (NonFiniteError, EnvironmentFailure) as failure:
+            print(f"error: {failure}", file=sys.stderr)
+            return FAILED
+    return DONE if finished else stop.exit_code
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Reads the command line; argparse itself exits with 2 on a mistake."""
+    parser = argparse.ArgumentParser(
+        prog="python -m trainers.learn", description="Train as a run file says."
+    )
+    parser.add_argument("config", type=Path, help="the run file")
+    parser.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="KEY=VALUE",
+        help="a dotted path into the run file, such as trainer.hyperparameters.learning_rate=3e-4",
+    )
+    parser.add_argument("--run-id", help="name of the run (default: the run file's name)")
+    existing = parser.add_mutually_exclusive_group()
+    existing.add_argument("--resume", action="store_true", help="go on with the run of that name")
+    existing.add_argument("--force", action="store_true", help="delete the run of that name first")
+    parser.add_argument(
+        "--initialize-from", metavar="RUN", help="begin with the weights of a run or a checkpoint"
+    )
+    parser.add_argument("--seed", type=int, help="overrides `seed`")
+    parser.add_argument("--num-envs", type=int, help="overrides `environment.num_envs`")
+    parser.add_argument("--device", help="overrides `device`, such as cpu or cuda")
+    parser.add_argument(
+        "--results-dir", type=Path, default=Path("results"), help="where runs are kept"
+    )
+    return parser.parse_intermixed_args(arguments)
+
+
+class Stop:
+    """Whether a signal asked the run to stop, and the exit code that says so."""
+
+    def __init__(self) -> None:
+        self.exit_code = DONE
+
+    def requested(self) -> bool:
+        """Whether to stop."""
+        return self.exit_code != DONE
+
+    def __call__(self, number: int, _frame: FrameType | None) -> None:
+        """Handles a signal: the first asks to stop, the second insists."""
+        if self.requested():
+            raise SystemExit(self.exit_code)
+        self.exit_code = INTERRUPTED if number == signal.SIGINT else TERMINATED
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[Stop]:
+    """Turns Ctrl-C and SIGTERM into a request to stop and save."""
+    stop = Stop()
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def shadowed_packages() -> str | None:
+    """What is wrong if another distribution's package hides one of ours; None if nothing is."""
+    home = Path(__file__).resolve().parents[1]
+    for package in PACKAGES:
+        spec = importlib.util.find_spec(package)
+        found = Path(spec.origin).resolve().parents[1] if spec and spec.origin else None
+        if found != home:
+            return (
+                f"the package {package!r} is found in {found}, not in {home}, where ventosa is: "
+                "another distribution has a package of that name; use a virtual environment "
+                "without it"
+            )
+    return None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,164 @@
+"""Encoders and a trunk: from observations to a hidden vector."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import gymnasium
+import torch
+from pydantic import BaseModel, Field
+from torch import Tensor, nn
+
+from trainers.observations import Observations, is_frame
+from trainers.plugins import suggestion
+from trainers.settings import Component, SettingsError
+
+ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
+    "relu": nn.ReLU,
+    "tanh": nn.Tanh,
+    "silu": nn.SiLU,
+    "elu": nn.ELU,
+}
+DEFAULT_IMAGE_ENCODER = "simple"
+DEFAULT_VECTOR_ENCODER = "vector"
+
+
+class NetworkSettings(BaseModel, frozen=True, extra="forbid"):
+    """The part of a network after its encoders."""
+
+    hidden_units: int = Field(256, ge=1, description="Units of each hidden layer.")
+    num_layers: int = Field(2, ge=0, description="Hidden layers after the encoders.")
+    activation: Literal["relu", "tanh", "silu", "elu"] = Field(
+        "relu", description="Activation of the hidden layers."
+    )
+    normalize: bool = Field(
+        False, description="Standardise vector observations whose encoder is not set otherwise."
+    )
+
+
+class Network(nn.Module):
+    """Encodes observations and passes them through a trunk of dense layers.
+
+    Args:
+        encoders: by the name of the observation; frames and vectors are told apart by `spaces`.
+        spaces: of the same names.
+        settings: the trunk.
+
+    Attributes:
+        features_dim: length of the hidden vector.
+    """
+
+    def __init__(
+        self,
+        encoders: Mapping[str, nn.Module],
+        spaces: Mapping[str, gymnasium.Space[Any]],
+        settings: NetworkSettings,
+    ):
+        super().__init__()
+        self.frame_encoders = nn.ModuleDict(
+            {k: e for k, e in encoders.items() if is_frame(spaces[k])}
+        )
+        self.vector_encoders = nn.ModuleDict(
+            {k: e for k, e in encoders.items() if not is_frame(spaces[k])}
+        )
+        width = sum(int(encoder.features_dim) for encoder in encoders.values())  # type: ignore[arg-type]
+        layers: list[nn.Module] = []
+        for _ in range(settings.num_layers):
+            layers += [_orthogonal(nn.Linear(width, settings.hidden_units), gain=2**0.5)]
+            layers += [ACTIVATIONS[settings.activation]()]
+            width = settings.hidden_units
+        self.trunk = nn.Sequential(*layers)
+        self.features_dim = width
+
+    def encode_frames(self, frames: Mapping[str, Tensor]) -> Tensor | None:
+        """Features (U, f) of frames; None for a network without cameras."""
+        parts = [encoder(frames[name]) for name, encoder in self.frame_encoders.items()]
+        return torch.cat(parts, dim=1) if parts else None
+
+    def forward(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
+        """Hidden vectors (B, features_dim).
+
+        Args:
+            observations: B observations.
+            frame_features: (B, f) what `encode_frames` said of their frames, where it is known.
+        """
+        if frame_features is None and self.frame_encoders:
+            frame_features = self.encode_frames(observations.frames)
+            if frame_features is not None and observations.frame_index is not None:
+                frame_features = frame_features[observations.frame_index]
+        parts = [] if frame_features is None else [frame_features]
+        vectors = observations.vectors
+        parts += [encoder(vectors[name]) for name, encoder in self.vector_encoders.items()]
+        hidden: Tensor = self.trunk(torch.cat(parts, dim=1))
+        return hidden
+
+    def update_statistics(self, vectors: Mapping[str, Tensor]) -> None:
+        """Shows vectors (B, n) to the encoders that standardise."""
+        for name, encoder in self.vector_encoders.items():
+            if hasattr(encoder, "update_statistics"):
+                encoder.update_statistics(vectors[name])
+
+
+class NetworkFactory:
+    """Builds networks for one run: it knows the spaces and the run file's encoders.
+
+    Args:
+        observation_space: of one environment.
+        action_space: of one environment.
+        encoders: the run file's, by the name of the observation.
+        defaults: the encoder of an observation the run file does not mention, by its space and the
+            network's settings.
+    """
+
+    def __init__(
+        self,
+        observation_space: gymnasium.spaces.Dict,
+        action_space: gymnasium.Space[Any],
+        encoders: Mapping[str, Component],
+        defaults: Callable[[gymnasium.Space[Any], NetworkSettings], Component],
+    ):
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self._encoders, self._defaults = encoders, defaults
+        for name in encoders:
+            self.check_name(name, "encoders")
+
+    def check_name(self, name: str, path: str) -> None:
+        """Refuses observations the environment does not have."""
+        if name not in self.observation_space.spaces:
+            names = sorted(self.observation_space.spaces)
+            raise SettingsError(
+                f"{path}: the environment has no observation {name!r}{suggestion(name, names)}; "
+                f"it has {names}"
+            )
+
+    def network(self, settings: NetworkSettings, names: Sequence[str]) -> Network:
+        """A new network on some of the observations.
+
+        Raises:
+            SettingsError: an encoder does not fit its observation.
+        """
+        spaces = {name: self.observation_space[name] for name in names}
+        encoders = {name: self._encoder(name, settings) for name in names}
+        return Network(encoders, spaces, settings)
+
+    def _encoder(self, name: str, settings: NetworkSettings) -> nn.Module:
+        space = self.observation_space[name]
+        component = self._encoders.get(name) or self._defaults(space, settings)
+        try:
+            encoder: nn.Module = component.cls(space, component.settings)
+        except ValueError as error:
+            raise SettingsError(f"encoders.{name} ({component.name}): {error}") from error
+        return encoder
+
+
+def _orthogonal(layer: nn.Linear, gain: float) -> nn.Linear:
+    nn.init.orthogonal_(layer.weight, gain)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def head(inputs: int, outputs: int, gain: float) -> nn.Linear:
+    """A last layer with small, orthogonal weights."""
+    return _orthogonal(nn.Linear(inputs, outputs), gain)

@@ -1,0 +1,10 @@
+"""The algorithms that ventosa brings along."""
+
+from trainers.hookspecs import hookimpl
+from trainers.ppo import PPO
+
+
+@hookimpl
+def ventosa_trainers() -> dict[str, type]:
+    """Return the built-in algorithms by name."""
+    return {"ppo": PPO}

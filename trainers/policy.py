@@ -1,0 +1,175 @@
+"""The actor and the critic of policy-gradient methods."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Literal
+
+import gymnasium
+import numpy as np
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+
+from trainers.distributions import Categorical, DiagonalGaussian, Distribution
+from trainers.networks import NetworkFactory, NetworkSettings, head
+from trainers.observations import Observations
+from trainers.settings import SettingsError
+
+ACTOR_GAIN = 0.01  # a small last layer: at first every observation gets nearly the same action
+CRITIC_GAIN = 1.0
+NETWORK_PATH = "trainer.network_settings"
+
+
+class PolicySettings(NetworkSettings, frozen=True, extra="forbid"):
+    """Networks of the actor and the critic."""
+
+    critic: Literal["shared", "separate"] = Field(
+        "shared", description="A critic on the actor's hidden vector, or one with its own network."
+    )
+    actor_observations: tuple[str, ...] | None = Field(
+        None, description="What the policy sees; null: every observation but `privileged`."
+    )
+    critic_observations: tuple[str, ...] | None = Field(
+        None, description="What a separate critic sees; null: what the policy sees."
+    )
+    initial_std: float = Field(
+        1.0, gt=0.0, description="Continuous actions: standard deviation to begin with."
+    )
+    min_std: float = Field(
+        0.001, gt=0.0, description="Continuous actions: the standard deviation never falls below."
+    )
+
+    @model_validator(mode="after")
+    def _critic_can_see(self) -> PolicySettings:
+        if self.critic == "shared" and self.critic_observations is not None:
+            raise ValueError("critic_observations needs critic: separate")
+        if self.min_std > self.initial_std:
+            raise ValueError(
+                f"min_std {self.min_std:g} is over initial_std {self.initial_std:g}: lower it"
+            )
+        return self
+
+
+class ActorCritic(nn.Module):
+    """A policy and a value function.
+
+    Args:
+        factory: builds the networks.
+        settings: what they look like.
+
+    Raises:
+        SettingsError: the settings don't fit the environment.
+    """
+
+    def __init__(self, factory: NetworkFactory, settings: PolicySettings):
+        super().__init__()
+        everything = tuple(factory.observation_space.spaces)
+        actor = settings.actor_observations or tuple(n for n in everything if n != "privileged")
+        critic = settings.critic_observations or actor
+        for path, names in (("actor_observations", actor), ("critic_observations", critic)):
+            for name in names:
+                factory.check_name(name, f"{NETWORK_PATH}.{path}")
+        self.actor = factory.network(settings, actor)
+        self.critic = factory.network(settings, critic) if settings.critic == "separate" else None
+        width = self.actor.features_dim
+        self.action_head: nn.Linear
+        self.log_std: nn.Parameter | None = None
+        match factory.action_space:
+            case gymnasium.spaces.Box(shape=(size,)):
+                self.action_head = head(width, size, ACTOR_GAIN)
+                initial = math.log(settings.initial_std)
+                self.log_std = nn.Parameter(torch.full((size,), initial))
+            case gymnasium.spaces.Discrete(n=count):
+                self.action_head = head(width, int(count), ACTOR_GAIN)
+            case other:
+                raise SettingsError(
+                    f"environment: actions of the space {other} are not supported; a Box of one "
+                    "dimension and Discrete are"
+                )
+        self._min_log_std = math.log(settings.min_std)
+        self.value_head = head(
+            width if self.critic is None else self.critic.features_dim, 1, CRITIC_GAIN
+        )
+
+    def forward(
+        self, observations: Observations, features: FrameFeatures | None = None
+    ) -> tuple[Distribution, Tensor]:
+        """The distribution of actions and the values (B,)."""
+        known = features or FrameFeatures(None, None)
+        hidden = self.actor(observations, known.actor)
+        return self._distribution(hidden), self._value(observations, hidden, known)
+
+    def distribution(self, observations: Observations) -> Distribution:
+        """The distribution of actions alone."""
+        return self._distribution(self.actor(observations))
+
+    def value(self, observations: Observations) -> Tensor:
+        """The values (B,) alone."""
+        hidden = self.actor(observations) if self.critic is None else None
+        return self._value(observations, hidden, FrameFeatures(None, None))
+
+    def encode_frames(self, observations: Observations) -> FrameFeatures:
+        """What the encoders say of frames, to be reused as long as neither changes."""
+        critic = None if self.critic is None else self.critic.encode_frames(observations.frames)
+        return FrameFeatures(self.actor.encode_frames(observations.frames), critic)
+
+    def update_statistics(self, vectors: dict[str, Tensor]) -> None:
+        """Shows vector observations to the encoders that standardise."""
+        for network in filter(None, (self.actor, self.critic)):
+            network.update_statistics(vectors)
+
+    def actor_parameters(self) -> Iterator[nn.Parameter]:
+        """Parameters of the policy; a shared network counts among them."""
+        yield from self.actor.parameters()
+        yield from self.action_head.parameters()
+        if self.log_std is not None:
+            yield self.log_std
+
+    def critic_parameters(self) -> Iterator[nn.Parameter]:
+        """Parameters of the value function alone."""
+        if self.critic is not None:
+            yield from self.critic.parameters()
+        yield from self.value_head.parameters()
+
+    def _distribution(self, hidden: Tensor) -> Distribution:
+        outputs = self.action_head(hidden)
+        if self.log_std is None:
+            return Categorical(outputs)
+        return DiagonalGaussian(outputs, self.log_std.clamp(min=self._min_log_std))
+
+    def _value(
+        self, observations: Observations, hidden: Tensor | None, known: FrameFeatures
+    ) -> Tensor:
+        if self.critic is not None:
+            hidden = self.critic(observations, known.critic)
+        value: Tensor = self.value_head(hidden).squeeze(-1)
+        return value
+
+
+class FrameFeatures:
+    """Features (B, f) of B frames, as the actor's and the critic's encoders gave them."""
+
+    def __init__(self, actor: Tensor | None, critic: Tensor | None):
+        self.actor, self.critic = actor, critic
+
+    def with_rows(self, rows: Tensor, other: FrameFeatures) -> FrameFeatures:
+        """These, with other features at some rows."""
+        return FrameFeatures(
+            _with_rows(self.actor, rows, other.actor), _with_rows(self.critic, rows, other.critic)
+        )
+
+
+def _with_rows(features: Tensor | None, rows: Tensor, other: Tensor | None) -> Tensor | None:
+    if features is None or other is None:
+        return None
+    return features.index_copy(0, rows, other)
+
+
+def to_environment(actions: Tensor, space: gymnasium.Space) -> np.ndarray:
+    """Actions as the environment takes them: within the bounds of a Box."""
+    values = actions.cpu().numpy()
+    if isinstance(space, gymnasium.spaces.Box):
+        return np.clip(values, space.low, space.high)
+    return values

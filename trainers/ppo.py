@@ -1,0 +1,239 @@
+"""Proximal Policy Optimization (Schulman et al. 2017, arXiv:1707.06347)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from pydantic import BaseModel, Field, model_validator
+from torch import Tensor, nn
+
+from trainers.algorithm import TrainerSettings
+from trainers.distributions import Distribution
+from trainers.interaction import Interaction, NonFiniteError
+from trainers.metrics import Averager
+from trainers.networks import NetworkFactory
+from trainers.on_policy import OnPolicyCollector
+from trainers.policy import ActorCritic, PolicySettings
+from trainers.returns import explained_variance, normalize
+from trainers.rollout import Rollout
+from trainers.schedules import Schedule
+
+CONSTANT = Schedule(type="constant")
+LINEAR = Schedule(type="linear")
+
+
+class PPOHyperparameters(BaseModel, frozen=True, extra="forbid"):
+    """Hyper-parameters of PPO, with ML-Agents' names where the thing is the same."""
+
+    batch_size: int = Field(512, ge=1, description="Transitions in one step of gradient descent.")
+    buffer_size: int = Field(8192, ge=1, description="Transitions collected before an update.")
+    num_epoch: int = Field(3, ge=1, description="Passes over the buffer in an update.")
+    learning_rate: float = Field(3e-4, gt=0.0, description="Of the policy, to begin with.")
+    critic_learning_rate: float | None = Field(
+        None, gt=0.0, description="Of the critic, to begin with; null: the policy's."
+    )
+    learning_rate_schedule: Schedule = Field(LINEAR, description="Course of both learning rates.")
+    gamma: float = Field(0.99, ge=0.0, le=1.0, description="Discount factor.")
+    lambd: float = Field(0.95, ge=0.0, le=1.0, description="Lambda of the advantage estimate.")
+    epsilon: float = Field(0.2, gt=0.0, description="How far the probability ratio may move.")
+    epsilon_schedule: Schedule = Field(CONSTANT, description="Course of epsilon.")
+    beta: float = Field(5e-3, ge=0.0, description="Weight of the entropy bonus.")
+    beta_schedule: Schedule = Field(LINEAR, description="Course of beta.")
+    kl_penalty: float = Field(0.0, ge=0.0, description="Weight of a penalty on KL(old || new).")
+    target_kl: float | None = Field(
+        None, gt=0.0, description="Ends an update once the mean KL(old || new) is over this."
+    )
+    value_coefficient: float = Field(0.5, gt=0.0, description="Weight of the value loss.")
+    value_clipping: float | None = Field(
+        None, gt=0.0, description="How far a value may move in an update; null: anywhere."
+    )
+    max_gradient_norm: float = Field(0.5, gt=0.0, description="Gradients are clipped to this norm.")
+
+    @model_validator(mode="after")
+    def _batch_fits(self) -> PPOHyperparameters:
+        if self.batch_size > self.buffer_size:
+            raise ValueError(
+                f"batch_size {self.batch_size} is over buffer_size {self.buffer_size}: lower "
+                "batch_size, or raise buffer_size"
+            )
+        return self
+
+
+class PPOSettings(TrainerSettings, frozen=True, extra="forbid"):
+    """The `trainer` section of a run with PPO."""
+
+    hyperparameters: PPOHyperparameters = Field(
+        default_factory=PPOHyperparameters, description="Hyper-parameters of PPO."
+    )
+    network_settings: PolicySettings = Field(
+        default_factory=PolicySettings, description="Networks of the actor and the critic."
+    )
+
+
+class PPO:
+    """PPO with a clipped objective. See `trainers.algorithm.Algorithm`."""
+
+    Settings = PPOSettings
+
+    def __init__(
+        self,
+        factory: NetworkFactory,
+        settings: PPOSettings,
+        interaction: Interaction,
+        generator: torch.Generator,
+        device: torch.device,
+    ):
+        self._hyperparameters = hyper = settings.hyperparameters
+        self._generator = generator
+        self.policy = ActorCritic(factory, settings.network_settings).to(device)
+        self._optimizer = torch.optim.Adam(
+            [
+                {"params": list(self.policy.actor_parameters())},
+                {"params": list(self.policy.critic_parameters())},
+            ],
+            lr=hyper.learning_rate,
+            eps=1e-5,
+        )
+        steps = -(-hyper.buffer_size // interaction.env.num_envs)
+        self._collector = OnPolicyCollector(self.policy, interaction, steps, generator, device)
+        self._interaction = interaction
+        self._rollout: Rollout | None = None
+
+    def collect(self) -> None:
+        """See `Algorithm.collect`."""
+        hyper = self._hyperparameters
+        self._rollout = self._collector.collect(hyper.gamma, hyper.lambd)
+
+    def update(self, progress: float) -> Mapping[str, float]:
+        """See `Algorithm.update`."""
+        rollout, self._rollout = self._rollout, None
+        if rollout is None:
+            raise RuntimeError("update() comes after collect()")
+        schedules = self._set_schedules(progress)
+        advantages = normalize(rollout.advantages)
+        averager = Averager()
+        for _ in range(self._hyperparameters.num_epoch):
+            if not self._epoch(rollout, advantages, schedules, averager):
+                break
+        self.policy.update_statistics(rollout.vectors)
+        statistics = averager.take()
+        variance = explained_variance(rollout.returns, rollout.values)
+        return statistics | schedules | {"Policy/Explained Variance": variance}
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Algorithm.state_dict`."""
+        return {"optimizer": self._optimizer.state_dict(), "generator": self._generator.get_state()}
+
+    def load_state_dict(self, weights: dict[str, Tensor], state: dict[str, Any]) -> None:
+        """See `Algorithm.load_state_dict`."""
+        self.policy.load_state_dict(weights)
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._generator.set_state(state["generator"])
+
+    def _set_schedules(self, progress: float) -> dict[str, float]:
+        hyper = self._hyperparameters
+        rate = hyper.learning_rate_schedule.value(hyper.learning_rate, progress)
+        critic_rate = hyper.learning_rate_schedule.value(
+            hyper.critic_learning_rate or hyper.learning_rate, progress
+        )
+        actor, critic = self._optimizer.param_groups
+        actor["lr"], critic["lr"] = rate, critic_rate
+        return {
+            "Policy/Learning Rate": rate,
+            "Policy/Critic Learning Rate": critic_rate,
+            "Policy/Epsilon": hyper.epsilon_schedule.value(hyper.epsilon, progress),
+            "Policy/Beta": hyper.beta_schedule.value(hyper.beta, progress),
+        }
+
+    def _epoch(
+        self,
+        rollout: Rollout,
+        advantages: Tensor,
+        schedules: dict[str, float],
+        averager: Averager,
+    ) -> bool:
+        """One pass over the rollout; False once the policy has moved far enough."""
+        hyper = self._hyperparameters
+        for rows in rollout.minibatches(hyper.batch_size, self._generator):
+            distribution, values = self.policy(rollout.observations(rows))
+            policy_loss, statistics = surrogate_loss(
+                distribution,
+                rollout.actions[rows],
+                rollout.log_probs[rows],
+                advantages[rows],
+                schedules["Policy/Epsilon"],
+            )
+            value_loss = clipped_value_loss(
+                values, rollout.values[rows], rollout.returns[rows], hyper.value_clipping
+            )
+            entropy = distribution.entropy().mean()
+            loss = (
+                policy_loss
+                + hyper.value_coefficient * value_loss
+                - schedules["Policy/Beta"] * entropy
+                + hyper.kl_penalty * statistics["Policy/KL"]
+            )
+            self._descend(loss)
+            statistics |= {
+                "Losses/Policy Loss": policy_loss,
+                "Losses/Value Loss": value_loss,
+                "Policy/Entropy": entropy,
+            }
+            means = {name: value.item() for name, value in statistics.items()}
+            averager.add(means, len(rows))
+            if hyper.target_kl is not None and means["Policy/KL"] > hyper.target_kl:
+                return False
+        return True
+
+    def _descend(self, loss: Tensor) -> None:
+        self._optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = nn.utils.clip_grad_norm_(
+            self.policy.parameters(), self._hyperparameters.max_gradient_norm
+        )
+        if not torch.isfinite(loss) or not torch.isfinite(norm):
+            raise NonFiniteError(
+                f"step {self._interaction.step_count}: the loss is {loss.item()}, its gradient's "
+                f"norm {norm.item()}"
+            )
+        self._optimizer.step()
+
+
+def surrogate_loss(
+    distribution: Distribution,
+    actions: Tensor,
+    old_log_probs: Tensor,
+    advantages: Tensor,
+    epsilon: float,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """PPO's clipped objective, negated (Schulman et al. 2017, eq. 7), with its diagnostics.
+
+    Args:
+        distribution: the present policy at B observations.
+        actions: (B, ...) drawn by the old policy.
+        old_log_probs: (B,) under the old policy.
+        advantages: (B,).
+        epsilon: how far the ratio may move from 1.
+    """
+    log_ratio = distribution.log_prob(actions) - old_log_probs
+    ratio = log_ratio.exp()
+    # L = E[min(r A, clip(r, 1 - eps, 1 + eps) A)]
+    clipped = ratio.clamp(1.0 - epsilon, 1.0 + epsilon)
+    loss = -torch.min(ratio * advantages, clipped * advantages).mean()
+    # KL(old || new) = E_old[(r - 1) - log r]: never negative, and of low variance.
+    divergence = ((ratio - 1.0) - log_ratio).mean()
+    clip_fraction = ((ratio - 1.0).abs() > epsilon).float().mean()
+    return loss, {"Policy/KL": divergence, "Policy/Clip Fraction": clip_fraction}
+
+
+def clipped_value_loss(
+    values: Tensor, old_values: Tensor, returns: Tensor, clipping: float | None
+) -> Tensor:
+    """Mean squared error of values (B,); with `clipping` the worse of the free and the clipped."""
+    loss = (values - returns).square()
+    if clipping is not None:
+        held = old_values + (values - old_values).clamp(-clipping, clipping)
+        loss = torch.max(loss, (held - returns).square())
+    return loss.mean()

@@ -1,0 +1,57 @@
+"""A run's folder under the results: `<results>/<run id>/`."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from trainers.files import write_atomically
+from trainers.settings import RunSettings, SettingsError, dump_yaml
+
+CONFIGURATION = "configuration.yaml"
+CHECKPOINTS = "checkpoints"
+
+
+def begin(directory: Path, run: RunSettings, *, resume: bool, force: bool) -> None:
+    """Makes a run's folder ready, and writes the resolved run file into it.
+
+    Args:
+        directory: the run's folder.
+        run: what is going to run.
+        resume: go on with the run that is there.
+        force: delete the run that is there.
+
+    Raises:
+        SettingsError: the folder is taken, has nothing to resume, or can't be written.
+    """
+    try:
+        taken = directory.exists() and any(directory.iterdir())
+        if resume and not has_checkpoints(directory):
+            raise SettingsError(
+                f"{directory}: there is no checkpoint to resume; start the run without --resume"
+            )
+        if taken and not resume:
+            if not force:
+                raise SettingsError(
+                    f"{directory}: this run exists already: go on with it (--resume), replace it "
+                    "(--force), or choose another --run-id"
+                )
+            if not (directory / CONFIGURATION).is_file():
+                raise SettingsError(
+                    f"{directory}: --force deletes runs, and this is none (it has no "
+                    f"{CONFIGURATION}); choose another --run-id"
+                )
+            shutil.rmtree(directory)
+        directory.mkdir(parents=True, exist_ok=True)
+        write_atomically(directory / CONFIGURATION, dump_yaml(run))
+    except OSError as error:
+        where = error.filename or directory
+        raise SettingsError(
+            f"{where}: the run's folder can't be written: {error.strerror or error}; choose another "
+            "--results-dir"
+        ) from error
+
+
+def has_checkpoints(directory: Path) -> bool:
+    """Whether a run's folder has any checkpoint."""
+    return any((directory / CHECKPOINTS).glob("step-*"))

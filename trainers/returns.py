@@ -1,0 +1,83 @@
+"""Advantages and returns of a rollout, and how well a critic foresees them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_EPSILON = 1e-8
+
+
+@torch.no_grad()
+def gae(
+    rewards: Tensor,
+    values: Tensor,
+    next_values: Tensor,
+    terminated: Tensor,
+    done: Tensor,
+    *,
+    gamma: float,
+    lambd: float,
+) -> tuple[Tensor, Tensor]:
+    """Estimate advantages by generalized advantage estimation (Schulman et al. 2016, eq. 11-16).
+
+    A terminated episode is worth nothing after its end; a truncated one would have gone on, so it
+    is bootstrapped with the value of its own last observation. Neither sees rewards of the episode
+    that follows it in the same column.
+
+    Args:
+        rewards: The reward of each step, (T, N) float.
+        values: The critic's value of the observation each step started from, (T, N).
+        next_values: The critic's value of the observation each step truly led to, (T, N): at an
+            episode's end the final observation, not the first of the next episode. Ignored where
+            `terminated`.
+        terminated: The episode ended in a terminal state, (T, N) bool.
+        done: The episode ended, terminated or truncated, (T, N) bool; true wherever `terminated`
+            is.
+        gamma: The discount per step, from 0 to 1.
+        lambd: How far rewards are trusted rather than the critic: 0 looks one step ahead, 1 is
+            the discounted return less the value.
+
+    Returns:
+        The advantages and the returns (advantages + values), both (T, N), without gradient.
+    """
+    # delta_t = r_t + gamma V(s_{t+1}) - V(s_t)    with V = 0 at terminal states
+    advantages = rewards + gamma * next_values.masked_fill(terminated, 0) - values
+    discounts = gamma * lambd * (~done).to(advantages.dtype)
+    # A_t = delta_t + gamma lambda A_{t+1}    within an episode
+    for t in reversed(range(len(advantages) - 1)):
+        advantages[t].addcmul_(discounts[t], advantages[t + 1])
+    return advantages, advantages + values
+
+
+def normalize(advantages: Tensor) -> Tensor:
+    """Shift and scale to mean 0 and (biased) standard deviation 1.
+
+    Equal values, a single one included, become 0.
+
+    Args:
+        advantages: Any shape; the statistics are taken over all entries, so leave out padding.
+
+    Returns:
+        A tensor of the same shape.
+    """
+    std, mean = torch.std_mean(advantages, correction=0)
+    return (advantages - mean) / (std + _EPSILON)
+
+
+def explained_variance(returns: Tensor, values: Tensor) -> float:
+    """Return the share of the returns' variance that the values foresee.
+
+    1 - Var[returns - values] / Var[returns]: 1 is a perfect critic, 0 one as good as any constant,
+    below 0 worse than that. When all returns are equal there is nothing to foresee, the quotient is
+    undefined, and the answer is 0.
+
+    Args:
+        returns: Any shape with at least one entry.
+        values: The critic's predictions of them, same shape.
+    """
+    # Relative to the first, so that equal returns have no variance left over from rounding.
+    total = (returns - returns.reshape(-1)[0]).var(correction=0).item()
+    if total == 0:
+        return 0.0
+    return 1 - (returns - values).var(correction=0).item() / total

@@ -1,0 +1,102 @@
+"""Experience of a policy-gradient update: T steps of N environments, each frame kept once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from trainers.observations import Observations, is_frame
+
+
+class FrameStore:
+    """Frames in the order they came, each once.
+
+    The memory is reserved for the most there can be; the operating system gives it page by page as
+    frames arrive, so that frames which are shared cost nothing.
+    """
+
+    def __init__(self, spaces: Mapping[str, gymnasium.Space[Any]], capacity: int):
+        self._arrays = {
+            name: np.empty((capacity, *(space.shape or ())), space.dtype)
+            for name, space in spaces.items()
+        }
+        self.count = 0
+
+    def add(
+        self, observations: Mapping[str, NDArray[Any]], rows: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Keeps some rows of the observations; returns the frames' indices."""
+        new = np.arange(self.count, self.count + len(rows))
+        for name, array in self._arrays.items():
+            array[new] = observations[name][rows]
+        self.count += len(rows)
+        return new
+
+    def tensors(self, device: torch.device) -> dict[str, Tensor]:
+        """All frames by name, (count, H, W, C); on the CPU without a copy."""
+        return {k: torch.from_numpy(a[: self.count]).to(device) for k, a in self._arrays.items()}
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """M transitions and their frames. Tensors have the leading axis M unless said otherwise.
+
+    Attributes:
+        frames: by name, (U, H, W, C).
+        frame_index: which of the U frames belongs to each transition.
+        vectors: by name, (M, n).
+        actions: as the policy drew them, before any clipping.
+        log_probs: of the actions under the policy that drew them.
+        values: under the critic of that time.
+        advantages: see `trainers.returns.gae`.
+        returns: what the critic should have said.
+    """
+
+    frames: dict[str, Tensor]
+    frame_index: Tensor
+    vectors: dict[str, Tensor]
+    actions: Tensor
+    log_probs: Tensor
+    values: Tensor
+    advantages: Tensor
+    returns: Tensor
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    def observations(self, rows: Tensor) -> Observations:
+        """Observations of some transitions, with the frames they share once."""
+        frames, index = self.frame_index[rows].unique(return_inverse=True)
+        chosen = {name: _take(tensor, frames) for name, tensor in self.frames.items()}
+        return Observations(chosen, {k: v[rows] for k, v in self.vectors.items()}, index)
+
+    def minibatches(self, size: int, generator: torch.Generator) -> Iterator[Tensor]:
+        """Splits all transitions at random into parts of `size` rows; the last may be smaller.
+
+        Transitions of one frame stay together, so that it is encoded once in a pass. Where every
+        transition has its own frame, this is a plain random split.
+        """
+        count = int(self.frame_index.max()) + 1
+        device = self.frame_index.device
+        place = torch.randperm(count, generator=generator, device=device)
+        order = torch.argsort(place[self.frame_index], stable=True)
+        yield from order.split(size)
+
+
+def frame_spaces(space: gymnasium.spaces.Dict) -> dict[str, gymnasium.Space[Any]]:
+    """The spaces of the images among the observations."""
+    return {name: part for name, part in space.spaces.items() if is_frame(part)}
+
+
+def _take(tensor: Tensor, index: Tensor) -> Tensor:
+    # torch indexes uint16 through its signed twin, which has all the operations.
+    if tensor.dtype == torch.uint16:
+        return tensor.view(torch.int16)[index].view(torch.uint16)
+    return tensor[index]

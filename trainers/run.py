@@ -1,0 +1,151 @@
+"""One run from its run file to its end: what `trainers.learn` does between parsing and exiting."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from trainers.algorithm import TrainerSettings
+from trainers.checkpoint import CheckpointError, Checkpoints, Loaded
+from trainers.interaction import NonFiniteError
+from trainers.metrics import RunLog
+from trainers.plugins import load_registries
+from trainers.progress import Progress, make_progress
+from trainers.results import CHECKPOINTS, begin
+from trainers.session import Session
+from trainers.settings import SettingsError, dump_yaml, load_run
+from trainers.summary import Summary
+from trainers.training import train
+
+
+def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) -> bool:
+    """Does what the command line asks for.
+
+    Args:
+        options: as `trainers.learn.parse` returns them.
+        stop_requested: asked before every step of the environments.
+
+    Returns:
+        Whether the run is finished; False if it was stopped and saved.
+
+    Raises:
+        SettingsError, PluginError, CheckpointError: the user's mistake.
+        NonFiniteError, EnvironmentFailure: the run can't go on.
+    """
+    registries = load_registries()
+    run = load_run(options.config, options.overrides + _flags(options), registries)
+    settings = run.trainer.settings
+    if not isinstance(settings, TrainerSettings):
+        raise SettingsError(f"trainer: the settings of {run.trainer.name!r} lack the common ones")
+    run_id = options.run_id or options.config.stem
+    directory = options.results_dir / run_id
+    checkpoints = Checkpoints(directory / CHECKPOINTS, settings.keep_checkpoints)
+    session = Session(run, registries, stop_requested)
+    try:
+        begin(directory, run, resume=options.resume, force=options.force)
+        resumed = _start(session, options, checkpoints)
+        start_step = session.interaction.step_count
+        log = RunLog(directory, start_step if resumed else None)
+        try:
+            log.text("configuration", f"```yaml\n{dump_yaml(run)}```", start_step)
+            summary = Summary(log, run_id, settings.max_steps, settings.summary_freq, start_step)
+            with make_progress(
+                run_id, settings.max_steps, session.lesson_count, start_step
+            ) as progress:
+                for note in resumed.notes if resumed else ():
+                    progress.message(note)
+                return _train(session, settings, summary, checkpoints, progress)
+        finally:
+            log.close()
+    finally:
+        session.close()
+
+
+def _train(
+    session: Session,
+    settings: TrainerSettings,
+    summary: Summary,
+    checkpoints: Checkpoints,
+    progress: Progress,
+) -> bool:
+    """Trains, and leaves the run's state in status.json however it ends."""
+    state = "failed"
+    try:
+        finished = train(session, settings, summary, checkpoints, progress)
+        state = "finished" if finished else "interrupted"
+        if not finished:
+            progress.message("stopped and saved; go on with --resume")
+        return finished
+    except NonFiniteError as error:
+        raise NonFiniteError(f"{error}; {_last_good(checkpoints)}") from error
+    finally:
+        saved = checkpoints.list_checkpoints()
+        if saved:
+            summary.note_checkpoint(saved[-1].path)
+        summary.status(session, state)
+
+
+def _last_good(checkpoints: Checkpoints) -> str:
+    saved = checkpoints.list_checkpoints()
+    if not saved:
+        return "no checkpoint was saved yet"
+    return f"the last good checkpoint is {saved[-1].path}"
+
+
+def _start(
+    session: Session, options: argparse.Namespace, checkpoints: Checkpoints
+) -> Loaded | None:
+    """Begins afresh, from other weights, or where the run stopped; returns what was resumed."""
+    if options.resume:
+        loaded = checkpoints.load_latest()
+        try:
+            session.load_state_dict(loaded.weights, loaded.state)
+        except (RuntimeError, ValueError, KeyError) as error:
+            raise SettingsError(
+                f"{loaded.path}: this checkpoint does not fit the run file, which must be the one "
+                f"the run began with: {_first_line(error)}"
+            ) from error
+        return loaded
+    if options.initialize_from:
+        weights = find_checkpoint(options.initialize_from, options.results_dir).weights
+        try:
+            session.algorithm.policy.load_state_dict(weights)
+        except RuntimeError as error:
+            raise SettingsError(
+                f"--initialize-from {options.initialize_from}: these weights do not fit the run "
+                f"file's networks: {_first_line(error)}"
+            ) from error
+    session.reset()
+    return None
+
+
+def find_checkpoint(name: str, results_dir: Path) -> Loaded:
+    """The weights of a checkpoint's folder, of a run's folder (its best), or of a run by its id.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    for directory in (Path(name), results_dir / name):
+        if (directory / CHECKPOINTS).is_dir():
+            return Checkpoints(directory / CHECKPOINTS, keep=1).load_best(with_state=False)
+        if (directory / "manifest.json").is_file():
+            return Checkpoints.load(directory, with_state=False)
+    raise CheckpointError(
+        f"{name}: neither a run nor a checkpoint, as it stands or under {results_dir}"
+    )
+
+
+def _flags(options: argparse.Namespace) -> list[str]:
+    """The command line's flags that stand for keys of the run file."""
+    flags = {
+        "seed": options.seed,
+        "environment.num_envs": options.num_envs,
+        "device": options.device,
+    }
+    return [f"{key}={value}" for key, value in flags.items() if value is not None]
+
+
+def _first_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return " ".join(lines[:2])

@@ -1,0 +1,195 @@
+"""A run's parts, wired together from its settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium
+import torch
+from torch import Tensor
+
+from curricula.curriculum import Curriculum, FinishedEpisodes, State
+from curricula.samplers import ParameterValue
+from envs.environment import Environment
+from rewards.reward import RewardTerm
+from trainers.algorithm import Algorithm
+from trainers.interaction import Episodes, Interaction
+from trainers.networks import (
+    DEFAULT_IMAGE_ENCODER,
+    DEFAULT_VECTOR_ENCODER,
+    NetworkFactory,
+    NetworkSettings,
+)
+from trainers.observations import is_frame
+from trainers.plugins import Registries, suggestion
+from trainers.settings import Component, RunSettings, SettingsError
+
+
+class Session:
+    """Everything that acts in a run, and the state it goes on from.
+
+    Args:
+        run: the settings.
+        registries: where the default encoders are found.
+        stop_requested: asked before every step of the environments.
+
+    Attributes:
+        interaction: the environments.
+        algorithm: learns from them.
+        curriculum: None where the run has none.
+
+    Raises:
+        SettingsError: the settings don't fit each other.
+    """
+
+    def __init__(
+        self,
+        run: RunSettings,
+        registries: Registries,
+        stop_requested: Callable[[], bool] = lambda: False,
+    ):
+        device = resolve_device(run.device)
+        self.curriculum = build_curriculum(run)
+        self._parameters = run.environment_parameters
+        self._curriculum_state: State = (
+            self.curriculum.initial_state() if self.curriculum is not None else {}
+        )
+        env = build_environment(run, run.seed)
+        try:
+            self._check_parameters(env)
+            torch.manual_seed(run.seed)
+            generator = torch.Generator(device).manual_seed(run.seed)
+            self.interaction = Interaction(env, stop_requested)
+            factory = build_factory(run, registries, env)
+            self.algorithm: Algorithm = run.trainer.cls(
+                factory, run.trainer.settings, self.interaction, generator, device
+            )
+        except BaseException:
+            env.close()
+            raise
+        env.set_parameters(self._parameters_now())
+
+    @property
+    def lesson(self) -> int:
+        """The present lesson, from 0."""
+        return 0 if self.curriculum is None else self.curriculum.lesson(self._curriculum_state)
+
+    @property
+    def lesson_count(self) -> int:
+        """Lessons of the curriculum; 1 without one."""
+        return 1 if self.curriculum is None else self.curriculum.lesson_count
+
+    def reset(self) -> None:
+        """Begins the run's first episodes."""
+        self.interaction.reset()
+
+    def advance_curriculum(self, episodes: Episodes, progress: float) -> bool:
+        """Shows finished episodes to the curriculum; True if a new lesson begins."""
+        if self.curriculum is None:
+            return False
+        before = self.lesson
+        finished = FinishedEpisodes(episodes.rewards, episodes.successes, progress)
+        self._curriculum_state = self.curriculum.advance(self._curriculum_state, finished)
+        if self.lesson == before:
+            return False
+        self.interaction.env.set_parameters(self._parameters_now())
+        return True
+
+    def weights(self) -> dict[str, Tensor]:
+        """The policy's weights."""
+        return dict(self.algorithm.policy.state_dict())
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything but the weights; taken between an update and the next collection."""
+        return {
+            "algorithm": self.algorithm.state_dict(),
+            "interaction": self.interaction.state_dict(),
+            "curriculum": self._curriculum_state,
+        }
+
+    def load_state_dict(self, weights: dict[str, Tensor], state: Mapping[str, Any]) -> None:
+        """Goes back to a state."""
+        self.algorithm.load_state_dict(weights, state["algorithm"])
+        if self.curriculum is not None:
+            self._curriculum_state = state["curriculum"]
+        self.interaction.env.set_parameters(self._parameters_now())
+        self.interaction.load_state_dict(state["interaction"])
+
+    def close(self) -> None:
+        """Ends the environments."""
+        self.interaction.env.close()
+
+    def _parameters_now(self) -> dict[str, ParameterValue]:
+        lesson = (
+            {} if self.curriculum is None else self.curriculum.parameters(self._curriculum_state)
+        )
+        return {**self._parameters, **lesson}
+
+    def _check_parameters(self, env: Environment) -> None:
+        sources = {"environment_parameters": self._parameters}
+        if self.curriculum is not None:
+            sources["curriculum"] = self.curriculum.parameters(self._curriculum_state)
+        for path, parameters in sources.items():
+            for name in sorted(set(parameters) - env.parameter_names):
+                raise SettingsError(
+                    f"{path}: the environment has no parameter {name!r}"
+                    f"{suggestion(name, env.parameter_names)}; it has "
+                    f"{sorted(env.parameter_names) or 'none'}"
+                )
+
+
+def resolve_device(name: str) -> torch.device:
+    """The torch device of a name, checked to be there.
+
+    Raises:
+        SettingsError: no such device.
+    """
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise SettingsError(f"device: {name!r} can't be used: {reason}; use 'cpu'") from error
+    return device
+
+
+def build_environment(run: RunSettings, seed: int) -> Environment:
+    """The run's environments, with its rewards.
+
+    Raises:
+        SettingsError: the settings don't fit together.
+    """
+    terms = [
+        RewardTerm(
+            reward.component.name, reward.weight, reward.component.cls(reward.component.settings)
+        )
+        for reward in run.rewards
+    ]
+    try:
+        env: Environment = run.environment.cls(run.environment.settings, terms, seed)
+    except ValueError as error:
+        raise SettingsError(f"environment ({run.environment.name}): {error}") from error
+    return env
+
+
+def build_curriculum(run: RunSettings) -> Curriculum | None:
+    """The run's curriculum, if it has one."""
+    if run.curriculum is None:
+        return None
+    curriculum: Curriculum = run.curriculum.cls(run.curriculum.settings)
+    return curriculum
+
+
+def build_factory(run: RunSettings, registries: Registries, env: Environment) -> NetworkFactory:
+    """What builds the networks of the run."""
+
+    def default_encoder(space: gymnasium.Space[Any], settings: NetworkSettings) -> Component:
+        name = DEFAULT_IMAGE_ENCODER if is_frame(space) else DEFAULT_VECTOR_ENCODER
+        entry = registries.encoders.get(name)
+        options = {} if is_frame(space) else {"normalize": settings.normalize}
+        return Component(name, entry.cls, entry.settings(**options))
+
+    return NetworkFactory(
+        env.single_observation_space, env.single_action_space, run.encoders, default_encoder
+    )

@@ -1,0 +1,71 @@
+"""The training loop: collect, update, log, advance the lesson, save."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from envs.environment import EnvironmentFailure
+from trainers.algorithm import TrainerSettings
+from trainers.checkpoint import Checkpoints
+from trainers.interaction import StopRequested
+from trainers.progress import Progress
+from trainers.session import Session
+from trainers.summary import Summary
+
+
+def train(
+    session: Session,
+    settings: TrainerSettings,
+    summary: Summary,
+    checkpoints: Checkpoints,
+    progress: Progress,
+) -> bool:
+    """Trains until the steps are used up or a stop is requested; what was learned is saved.
+
+    Returns:
+        Whether the run is finished; False if it was stopped.
+
+    Raises:
+        EnvironmentFailure: an environment broke down; the run is saved as of the last update.
+        NonFiniteError: a reward, an observation or a loss is not finite; nothing new is saved.
+    """
+    interaction, algorithm = session.interaction, session.algorithm
+    max_steps = settings.max_steps
+    saved_at = interaction.step_count
+    while interaction.step_count < max_steps:
+        # Between an update and the next collection is where a run can be taken up again.
+        step, boundary = interaction.step_count, session.state_dict()
+        try:
+            algorithm.collect()
+        except (StopRequested, EnvironmentFailure) as stop:
+            _save(session, checkpoints, step, boundary, summary.score)
+            if isinstance(stop, StopRequested):
+                return False
+            raise
+        share = min(interaction.step_count / max_steps, 1.0)
+        summary.add(algorithm.update(share))
+        episodes = interaction.take_finished()
+        summary.add_episodes(episodes)
+        if session.advance_curriculum(episodes, share):
+            progress.message(
+                f"step {interaction.step_count}: lesson {session.lesson + 1} of "
+                f"{session.lesson_count} begins"
+            )
+        summary.report(session, progress)
+        if interaction.step_count - saved_at >= settings.checkpoint_interval:
+            saved_at = interaction.step_count
+            path = _save(session, checkpoints, saved_at, session.state_dict(), summary.score)
+            summary.note_checkpoint(path)
+    _save(session, checkpoints, interaction.step_count, session.state_dict(), summary.score)
+    return True
+
+
+def _save(
+    session: Session,
+    checkpoints: Checkpoints,
+    step: int,
+    state: dict[str, Any],
+    score: float | None,
+) -> Path:
+    return checkpoints.save(step, session.weights(), {"step": step, **state}, score)
