@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import torch
 
 MM_PER_M = 1000
 UINT8_MAX = 255
@@ -90,7 +92,7 @@ class DepthImage(Box):
         """
         min_m, max_m = self.range_m
         # torch has next to no arithmetic on uint16, so leave it first.
-        values = raw.to(torch.float32)
+        values = raw.float()
         if self.encoding == "uint8":
             # The paper's equation "clamp", as in the docstring of the class.
             metres = min_m + values * ((max_m - min_m) / UINT8_MAX)

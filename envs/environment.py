@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
-import numpy as np
+import gymnasium
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from pydantic import BaseModel
@@ -15,13 +15,15 @@ from curricula.samplers import ParameterValue
 from rewards.reward import RewardTerm
 
 Observations = dict[str, NDArray[Any]]
+StepResult = tuple[Observations, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]
+"""Observations, rewards (N,), terminated (N,), truncated (N,) and infos."""
 
 
 class EnvironmentFailure(RuntimeError):  # noqa: N818 - gymnasium's Error says something else
     """An environment broke down, through no fault of the run file: a process died, for instance."""
 
 
-class Environment(VectorEnv[Observations, NDArray[Any], NDArray[np.float64]]):
+class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     """N environments stepped together, with dictionaries of observations.
 
     It resets an environment in the step its episode ends in (`AutoresetMode.SAME_STEP`). The
@@ -43,6 +45,7 @@ class Environment(VectorEnv[Observations, NDArray[Any], NDArray[np.float64]]):
 
     Settings: ClassVar[type[BaseModel]]
     parameter_names: ClassVar[frozenset[str]] = frozenset()
+    single_observation_space: gymnasium.spaces.Dict
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     @abstractmethod

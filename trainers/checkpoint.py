@@ -31,6 +31,7 @@ import safetensors.torch
 import torch
 from pydantic import BaseModel, ValidationError
 
+from trainers.errors import UserError
 from trainers.files import naming, sync, write_atomically
 from trainers.serialization import flatten, unflatten
 
@@ -44,7 +45,7 @@ _FOLDER = re.compile(r"step-(\d+)")
 _LEFTOVER = re.compile(r"\.step-(\d+)\.(tmp|old)-\w+")
 
 
-class CheckpointError(Exception):
+class CheckpointError(UserError):
     """No usable checkpoint; the message says where, why, and the way out."""
 
 

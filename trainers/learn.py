@@ -23,16 +23,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return MISTAKE
     # Imported late, so that `--help` and a mistyped option answer at once.
     from envs.environment import EnvironmentFailure  # noqa: PLC0415
-    from trainers.checkpoint import CheckpointError  # noqa: PLC0415
+    from trainers.errors import UserError  # noqa: PLC0415
     from trainers.interaction import NonFiniteError  # noqa: PLC0415
-    from trainers.plugins import PluginError  # noqa: PLC0415
     from trainers.run import run_file  # noqa: PLC0415
-    from trainers.settings import SettingsError  # noqa: PLC0415
 
     with stop_on_signals() as stop:
         try:
             finished = run_file(options, stop.requested)
-        except (SettingsError, PluginError, CheckpointError) as mistake:
+        except UserError as mistake:
             print(f"error: {mistake}", file=sys.stderr)
             return MISTAKE
         except (NonFiniteError, EnvironmentFailure) as failure:

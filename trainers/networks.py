@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import gymnasium
 import torch
 from pydantic import BaseModel, Field
 from torch import Tensor, nn
 
+from trainers.errors import UserError
 from trainers.observations import Observations, is_frame
 from trainers.plugins import suggestion
-from trainers.settings import Component, SettingsError
+from trainers.settings import Component
 
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
     "relu": nn.ReLU,
@@ -35,6 +36,14 @@ class NetworkSettings(BaseModel, frozen=True, extra="forbid"):
     normalize: bool = Field(
         False, description="Standardise vector observations whose encoder is not set otherwise."
     )
+
+
+@runtime_checkable
+class Standardizing(Protocol):
+    """An encoder that standardises by what it has seen."""
+
+    def update_statistics(self, batch: Tensor) -> None:
+        """Shows it raw vectors (B, n)."""
 
 
 class Network(nn.Module):
@@ -62,7 +71,7 @@ class Network(nn.Module):
         self.vector_encoders = nn.ModuleDict(
             {k: e for k, e in encoders.items() if not is_frame(spaces[k])}
         )
-        width = sum(int(encoder.features_dim) for encoder in encoders.values())  # type: ignore[arg-type]
+        width = sum(cast(int, encoder.features_dim) for encoder in encoders.values())
         layers: list[nn.Module] = []
         for _ in range(settings.num_layers):
             layers += [_orthogonal(nn.Linear(width, settings.hidden_units), gain=2**0.5)]
@@ -96,7 +105,7 @@ class Network(nn.Module):
     def update_statistics(self, vectors: Mapping[str, Tensor]) -> None:
         """Shows vectors (B, n) to the encoders that standardise."""
         for name, encoder in self.vector_encoders.items():
-            if hasattr(encoder, "update_statistics"):
+            if isinstance(encoder, Standardizing):
                 encoder.update_statistics(vectors[name])
 
 
@@ -128,7 +137,7 @@ class NetworkFactory:
         """Refuses observations the environment does not have."""
         if name not in self.observation_space.spaces:
             names = sorted(self.observation_space.spaces)
-            raise SettingsError(
+            raise UserError(
                 f"{path}: the environment has no observation {name!r}{suggestion(name, names)}; "
                 f"it has {names}"
             )
@@ -137,7 +146,7 @@ class NetworkFactory:
         """A new network on some of the observations.
 
         Raises:
-            SettingsError: an encoder does not fit its observation.
+            UserError: an encoder does not fit its observation.
         """
         spaces = {name: self.observation_space[name] for name in names}
         encoders = {name: self._encoder(name, settings) for name in names}
@@ -149,7 +158,7 @@ class NetworkFactory:
         try:
             encoder: nn.Module = component.cls(space, component.settings)
         except ValueError as error:
-            raise SettingsError(f"encoders.{name} ({component.name}): {error}") from error
+            raise UserError(f"encoders.{name} ({component.name}): {error}") from error
         return encoder
 
 

@@ -46,7 +46,8 @@ def to_tensors(
     rows: NDArray[np.int64] | None = None,
 ) -> Observations:
     """Observations as an environment gives them, or some rows of them, as tensors."""
-    frames, vectors = {}, {}
+    frames: dict[str, Tensor] = {}
+    vectors: dict[str, Tensor] = {}
     for name, values in observations.items():
         chosen = values if rows is None else values[rows]
         tensor = torch.from_numpy(np.ascontiguousarray(chosen)).to(device)

@@ -50,13 +50,14 @@ class OnPolicyCollector:
         """
         count = self._interaction.env.num_envs
         everyone = np.arange(count)
-        images = frame_spaces(self._space)  # type: ignore[arg-type]
+        images = frame_spaces(self._space)
         frames = FrameStore(images, self._steps * count if images else 0)
         frame_of = np.zeros(count, np.int64)
         new_frames = everyone
         features = FrameFeatures(None, None)
         columns: dict[str, list[Tensor]] = {}
-        indices, steps = [], []
+        indices: list[NDArray[np.int64]] = []
+        steps: list[Step] = []
         for _ in range(self._steps):
             raw = self._interaction.observations
             if images:

@@ -27,6 +27,7 @@ from torch import nn
 
 from envs.environment import Environment
 from trainers import hookspecs
+from trainers.errors import UserError
 from trainers.plugin_listing import component_rows, print_plain, print_tables
 
 BUILT_IN = "built-in"
@@ -53,7 +54,7 @@ class Origin:
         return f"plugin '{self.plugin}' ({self.distribution})"
 
 
-class PluginError(Exception):
+class PluginError(UserError):
     """A plugin cannot be used; the message names it, its distribution and the reason."""
 
     def __init__(self, origin: Origin, reason: str) -> None:

@@ -13,9 +13,9 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from trainers.distributions import Categorical, DiagonalGaussian, Distribution
+from trainers.errors import UserError
 from trainers.networks import NetworkFactory, NetworkSettings, head
 from trainers.observations import Observations
-from trainers.settings import SettingsError
 
 ACTOR_GAIN = 0.01  # a small last layer: at first every observation gets nearly the same action
 CRITIC_GAIN = 1.0
@@ -60,7 +60,7 @@ class ActorCritic(nn.Module):
         settings: what they look like.
 
     Raises:
-        SettingsError: the settings don't fit the environment.
+        UserError: the settings don't fit the environment.
     """
 
     def __init__(self, factory: NetworkFactory, settings: PolicySettings):
@@ -84,7 +84,7 @@ class ActorCritic(nn.Module):
             case gymnasium.spaces.Discrete(n=count):
                 self.action_head = head(width, int(count), ACTOR_GAIN)
             case other:
-                raise SettingsError(
+                raise UserError(
                     f"environment: actions of the space {other} are not supported; a Box of one "
                     "dimension and Discrete are"
                 )

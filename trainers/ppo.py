@@ -189,7 +189,7 @@ class PPO:
 
     def _descend(self, loss: Tensor) -> None:
         self._optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         norm = nn.utils.clip_grad_norm_(
             self.policy.parameters(), self._hyperparameters.max_gradient_norm
         )

@@ -5,8 +5,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from trainers.errors import UserError
 from trainers.files import write_atomically
-from trainers.settings import RunSettings, SettingsError, dump_yaml
+from trainers.settings import RunSettings, dump_yaml
 
 CONFIGURATION = "configuration.yaml"
 CHECKPOINTS = "checkpoints"
@@ -22,22 +23,22 @@ def begin(directory: Path, run: RunSettings, *, resume: bool, force: bool) -> No
         force: delete the run that is there.
 
     Raises:
-        SettingsError: the folder is taken, has nothing to resume, or can't be written.
+        UserError: the folder is taken, has nothing to resume, or can't be written.
     """
     try:
         taken = directory.exists() and any(directory.iterdir())
         if resume and not has_checkpoints(directory):
-            raise SettingsError(
+            raise UserError(
                 f"{directory}: there is no checkpoint to resume; start the run without --resume"
             )
         if taken and not resume:
             if not force:
-                raise SettingsError(
+                raise UserError(
                     f"{directory}: this run exists already: go on with it (--resume), replace it "
                     "(--force), or choose another --run-id"
                 )
             if not (directory / CONFIGURATION).is_file():
-                raise SettingsError(
+                raise UserError(
                     f"{directory}: --force deletes runs, and this is none (it has no "
                     f"{CONFIGURATION}); choose another --run-id"
                 )
@@ -46,9 +47,9 @@ def begin(directory: Path, run: RunSettings, *, resume: bool, force: bool) -> No
         write_atomically(directory / CONFIGURATION, dump_yaml(run))
     except OSError as error:
         where = error.filename or directory
-        raise SettingsError(
-            f"{where}: the run's folder can't be written: {error.strerror or error}; choose another "
-            "--results-dir"
+        raise UserError(
+            f"{where}: the run's folder can't be written: {error.strerror or error}; "
+            "choose another --results-dir"
         ) from error
 
 

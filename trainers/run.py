@@ -7,14 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 from trainers.algorithm import TrainerSettings
-from trainers.checkpoint import CheckpointError, Checkpoints, Loaded
+from trainers.checkpoint import Checkpoints, Loaded
+from trainers.errors import UserError
 from trainers.interaction import NonFiniteError
 from trainers.metrics import RunLog
 from trainers.plugins import load_registries
 from trainers.progress import Progress, make_progress
 from trainers.results import CHECKPOINTS, begin
 from trainers.session import Session
-from trainers.settings import SettingsError, dump_yaml, load_run
+from trainers.settings import dump_yaml, load_run
 from trainers.summary import Summary
 from trainers.training import train
 
@@ -30,14 +31,14 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
         Whether the run is finished; False if it was stopped and saved.
 
     Raises:
-        SettingsError, PluginError, CheckpointError: the user's mistake.
+        UserError: the user's mistake.
         NonFiniteError, EnvironmentFailure: the run can't go on.
     """
     registries = load_registries()
     run = load_run(options.config, options.overrides + _flags(options), registries)
     settings = run.trainer.settings
     if not isinstance(settings, TrainerSettings):
-        raise SettingsError(f"trainer: the settings of {run.trainer.name!r} lack the common ones")
+        raise UserError(f"trainer: the settings of {run.trainer.name!r} lack the common ones")
     run_id = options.run_id or options.config.stem
     directory = options.results_dir / run_id
     checkpoints = Checkpoints(directory / CHECKPOINTS, settings.keep_checkpoints)
@@ -102,7 +103,7 @@ def _start(
         try:
             session.load_state_dict(loaded.weights, loaded.state)
         except (RuntimeError, ValueError, KeyError) as error:
-            raise SettingsError(
+            raise UserError(
                 f"{loaded.path}: this checkpoint does not fit the run file, which must be the one "
                 f"the run began with: {_first_line(error)}"
             ) from error
@@ -112,7 +113,7 @@ def _start(
         try:
             session.algorithm.policy.load_state_dict(weights)
         except RuntimeError as error:
-            raise SettingsError(
+            raise UserError(
                 f"--initialize-from {options.initialize_from}: these weights do not fit the run "
                 f"file's networks: {_first_line(error)}"
             ) from error
@@ -124,16 +125,14 @@ def find_checkpoint(name: str, results_dir: Path) -> Loaded:
     """The weights of a checkpoint's folder, of a run's folder (its best), or of a run by its id.
 
     Raises:
-        CheckpointError: there is none.
+        UserError: there is none.
     """
     for directory in (Path(name), results_dir / name):
         if (directory / CHECKPOINTS).is_dir():
             return Checkpoints(directory / CHECKPOINTS, keep=1).load_best(with_state=False)
         if (directory / "manifest.json").is_file():
             return Checkpoints.load(directory, with_state=False)
-    raise CheckpointError(
-        f"{name}: neither a run nor a checkpoint, as it stands or under {results_dir}"
-    )
+    raise UserError(f"{name}: neither a run nor a checkpoint, as it stands or under {results_dir}")
 
 
 def _flags(options: argparse.Namespace) -> list[str]:

@@ -14,6 +14,7 @@ from curricula.samplers import ParameterValue
 from envs.environment import Environment
 from rewards.reward import RewardTerm
 from trainers.algorithm import Algorithm
+from trainers.errors import UserError
 from trainers.interaction import Episodes, Interaction
 from trainers.networks import (
     DEFAULT_IMAGE_ENCODER,
@@ -23,7 +24,7 @@ from trainers.networks import (
 )
 from trainers.observations import is_frame
 from trainers.plugins import Registries, suggestion
-from trainers.settings import Component, RunSettings, SettingsError
+from trainers.settings import Component, RunSettings
 
 
 class Session:
@@ -40,7 +41,7 @@ class Session:
         curriculum: None where the run has none.
 
     Raises:
-        SettingsError: the settings don't fit each other.
+        UserError: the settings don't fit each other.
     """
 
     def __init__(
@@ -132,7 +133,7 @@ class Session:
             sources["curriculum"] = self.curriculum.parameters(self._curriculum_state)
         for path, parameters in sources.items():
             for name in sorted(set(parameters) - env.parameter_names):
-                raise SettingsError(
+                raise UserError(
                     f"{path}: the environment has no parameter {name!r}"
                     f"{suggestion(name, env.parameter_names)}; it has "
                     f"{sorted(env.parameter_names) or 'none'}"
@@ -143,14 +144,14 @@ def resolve_device(name: str) -> torch.device:
     """The torch device of a name, checked to be there.
 
     Raises:
-        SettingsError: no such device.
+        UserError: no such device.
     """
     try:
         device = torch.device(name)
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
-        raise SettingsError(f"device: {name!r} can't be used: {reason}; use 'cpu'") from error
+        raise UserError(f"device: {name!r} can't be used: {reason}; use 'cpu'") from error
     return device
 
 
@@ -158,7 +159,7 @@ def build_environment(run: RunSettings, seed: int) -> Environment:
     """The run's environments, with its rewards.
 
     Raises:
-        SettingsError: the settings don't fit together.
+        UserError: the settings don't fit together.
     """
     terms = [
         RewardTerm(
@@ -169,7 +170,7 @@ def build_environment(run: RunSettings, seed: int) -> Environment:
     try:
         env: Environment = run.environment.cls(run.environment.settings, terms, seed)
     except ValueError as error:
-        raise SettingsError(f"environment ({run.environment.name}): {error}") from error
+        raise UserError(f"environment ({run.environment.name}): {error}") from error
     return env
 
 

@@ -16,6 +16,8 @@ from typing import Any
 
 import yaml
 
+from trainers.errors import UserError
+
 KeyPath = tuple[str | int, ...]
 """Keys and list indices that lead to a value, from the top of the run file."""
 
@@ -71,7 +73,7 @@ class Problem:
         return ": ".join(filter(None, (self.where, dotted(self.path), self.message)))
 
 
-class SettingsError(Exception):
+class SettingsError(UserError):
     """The run file or an override is wrong; the message says all that was found, a line each."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:

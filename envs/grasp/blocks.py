@@ -29,6 +29,28 @@ U_LEG_SHARE = (0.25, 0.35)
 
 
 @dataclass(frozen=True)
+class Dimensions:
+    """What n blocks are made from; arrays (n,).
+
+    Attributes:
+        shape: PARALLELEPIPED, L_SHAPE or U_SHAPE.
+        width_m, height_m: of the face.
+        depth_m: behind the face.
+        bar_m: thickness of the bar on top of an L or a U.
+        leg_share: in [0, 1], from the narrowest to the widest leg of the shape.
+        leg_on_left: on which side an L has its leg.
+    """
+
+    shape: NDArray[np.int64]
+    width_m: Floats
+    height_m: Floats
+    depth_m: Floats
+    bar_m: Floats
+    leg_share: Floats
+    leg_on_left: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
 class Blocks:
     """n blocks, each up to three boxes in its body frame.
 
@@ -65,35 +87,35 @@ def sample_blocks(
     """Draws the dimensions of n blocks whose shapes (n,) are given."""
     n = len(shape)
     width, height = rng.uniform(*size_range_m, (2, n))
-    depth = rng.uniform(*depth_range_m, n)
-    bar = rng.uniform(MIN_BAR_M, np.maximum(MIN_BAR_M, MAX_BAR_SHARE * height))
-    leg_share = rng.random(n)
-    leg_on_left = rng.random(n) < 0.5
-    return make_blocks(shape, width, height, depth, bar, leg_share, leg_on_left)
+    return make_blocks(
+        Dimensions(
+            shape=shape,
+            width_m=width,
+            height_m=height,
+            depth_m=rng.uniform(*depth_range_m, n),
+            bar_m=rng.uniform(MIN_BAR_M, np.maximum(MIN_BAR_M, MAX_BAR_SHARE * height)),
+            leg_share=rng.random(n),
+            leg_on_left=rng.random(n) < 0.5,
+        )
+    )
 
 
-def make_blocks(
-    shape: NDArray[np.int64],
-    width: Floats,
-    height: Floats,
-    depth: Floats,
-    bar: Floats,
-    leg_share: Floats,
-    leg_on_left: NDArray[np.bool_],
-) -> Blocks:
-    """Builds n blocks from their dimensions, all (n,), metres.
+def make_blocks(dimensions: Dimensions) -> Blocks:
+    """Builds n blocks.
 
-    `leg_share` in [0, 1] chooses the legs' width between the least and the most of the shape. A U
-    has two equal largest discs; the left one (towards +y) is meant, so that an image always tells.
+    A U has two equal largest discs; the left one (towards +y) is meant, so that an image always
+    tells.
     """
+    shape, width, height = dimensions.shape, dimensions.width_m, dimensions.height_m
+    depth, bar = dimensions.depth_m, dimensions.bar_m
     is_l, is_u = shape == L_SHAPE, shape == U_SHAPE
     has_bar = is_l | is_u
     low, high = (
         np.where(is_l, L_LEG_SHARE[0], U_LEG_SHARE[0]),
         np.where(is_l, L_LEG_SHARE[1], U_LEG_SHARE[1]),
     )
-    leg = width * (low + (high - low) * leg_share)
-    side = np.where(is_u | leg_on_left, 1.0, -1.0)
+    leg = width * (low + (high - low) * dimensions.leg_share)
+    side = np.where(is_u | dimensions.leg_on_left, 1.0, -1.0)
     top = np.where(has_bar, bar, height)
 
     center = np.zeros((len(shape), BOXES_PER_BLOCK, 3))

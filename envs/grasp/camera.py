@@ -7,6 +7,7 @@ Camera axes are OpenCV's: x to the right, y down, z forward; depth is measured a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,6 @@ from envs.grasp.batch import Batch
 from envs.grasp.settings import Camera
 
 Floats = NDArray[np.float64]
-Frame = NDArray[np.floating] | NDArray[np.integer]
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def small_rotation(angles_rad: Floats) -> Floats:
 def sample_views(
     camera: Camera, rng: np.random.Generator, n: int, position_m: float, rotation_deg: float
 ) -> Views:
-    """Places n cameras, each coordinate moved by up to +-`position_m`, each axis by `rotation_deg`."""
+    """Places n cameras, moved by up to +-`position_m` and turned by `rotation_deg` per axis."""
     nominal = np.array(camera.position_m)
     jitter = np.radians(rng.uniform(-rotation_deg, rotation_deg, (n, 3)))
     return Views(
@@ -110,7 +110,7 @@ def sense_depth(
     space: DepthImage,
     noise_sigma_m: Floats,
     seeds: NDArray[np.uint64],
-) -> Frame:
+) -> NDArray[Any]:
     """The sensor's model: true depth -> Gaussian noise -> clamp -> encoding.
 
     Args:

@@ -14,10 +14,9 @@ from envs.grasp.vector_env import GraspVectorEnv
 from rewards.plugin import ventosa_rewards
 from rewards.reward import RewardTerm
 
-DEFAULT_REWARDS = {
-    name: 1.0
-    for name in ("touch", "collision", "position", "rotation", "approach", "facing")
-}
+DEFAULT_REWARDS = dict.fromkeys(
+    ("touch", "collision", "position", "rotation", "approach", "facing"), 1.0
+)
 
 
 def make_vector_env(
@@ -51,7 +50,7 @@ def make_vector_env(
     )
 
 
-class GraspEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
+class GraspEnv(gymnasium.Env[Any, NDArray[Any]]):
     """One grasp environment: the N = 1 view of `GraspVectorEnv`, which leaves resets to its user.
 
     Args:
@@ -94,7 +93,7 @@ class GraspEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[Any]]):
             info,
         )
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """A picture (480, 640, 3); None where PyBullet's window shows it."""
         pictures = self._batch.render()
         return None if pictures is None else pictures[0]

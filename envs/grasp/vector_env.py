@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from curricula.samplers import ParameterValue, draw
 from encoders.spaces import DepthImage, RgbImage
-from envs.environment import Environment, Observations
+from envs.environment import Environment, Observations, StepResult
 from envs.grasp.camera import Views, sample_views
 from envs.grasp.scene import Scenes, SceneSampler
 from envs.grasp.settings import Camera, GraspSettings
@@ -89,7 +89,7 @@ class GraspVectorEnv(Environment):
     # -- gymnasium's interface -------------------------------------------------------------------
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
         """Begins new episodes, in all environments or where `options["reset_mask"]` (N,) is set."""
         if seed is not None:
@@ -100,11 +100,7 @@ class GraspVectorEnv(Environment):
         self._begin(np.flatnonzero(mask))
         return self._observations(), {}
 
-    def step(
-        self, actions: NDArray[Any]
-    ) -> tuple[
-        Observations, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
-    ]:
+    def step(self, actions: NDArray[Any]) -> StepResult:
         """Moves every robot; see `Environment` for the `infos`."""
         observations, reward, terminated, truncated, infos = self.step_without_reset(actions)
         done = terminated | truncated
@@ -115,11 +111,7 @@ class GraspVectorEnv(Environment):
             infos["same_frame"] = infos["same_frame"] & ~done
         return observations, reward, terminated, truncated, infos
 
-    def step_without_reset(
-        self, actions: NDArray[Any]
-    ) -> tuple[
-        Observations, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
-    ]:
+    def step_without_reset(self, actions: NDArray[Any]) -> StepResult:
         """As `step`, but leaves finished episodes as they are."""
         actions = np.asarray(actions, np.float64)
         if actions.shape != (self.num_envs, 4) or not np.isfinite(actions).all():
@@ -236,7 +228,7 @@ class GraspVectorEnv(Environment):
             self._scenes, self._views, self._region = scenes, views, region
             self._tools, self._progress = tools, progress
             self._images = {
-                name: np.zeros((n, *self.single_observation_space[name].shape), space.dtype)
+                name: np.zeros((n, *space.shape), space.dtype)
                 for name, space in self._image_spaces().items()
             }
             self._begun = True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from envs.grasp.scene import Scenes
 
 Indices = NDArray[np.int64]
 Floats = NDArray[np.float64]
-Images = NDArray[np.float32] | NDArray[np.uint8]
+Images = NDArray[Any]
 
 
 class SimulatorError(EnvironmentFailure):
@@ -58,7 +58,7 @@ class Simulator(Protocol):
 
     def sense(
         self, indices: Indices, views: Views, space: DepthImage, seeds: NDArray[np.uint64]
-    ) -> NDArray[np.integer]:
+    ) -> Images:
         """Takes n depth pictures as the sensor delivers them.
 
         Args:

@@ -65,7 +65,7 @@ class PyBulletSimulator:
 
     def sense(
         self, indices: Indices, views: Views, space: DepthImage, seeds: NDArray[np.uint64]
-    ) -> NDArray[np.integer]:
+    ) -> Images:
         """See `Simulator.sense`."""
         return sense_depth(self.render(indices, views), space, views.noise_sigma_m, seeds)
 

@@ -59,7 +59,7 @@ class ParallelSimulator:
 
     def sense(
         self, indices: Indices, views: Views, space: DepthImage, seeds: NDArray[np.uint64]
-    ) -> NDArray[np.integer]:
+    ) -> Images:
         """See `Simulator.sense`."""
         return np.concatenate(self._call("sense", indices, views, space, seeds))
 
