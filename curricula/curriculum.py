@@ -66,3 +66,7 @@ class Curriculum(Protocol):
     def parameters(self, state: State) -> dict[str, ParameterValue]:
         """Return the environment parameters of the current lesson: numbers or samplers."""
         ...
+
+    def final_parameters(self) -> dict[str, ParameterValue]:
+        """Return the environment parameters of the last lesson, on which policies are judged."""
+        ...

@@ -94,6 +94,10 @@ class Lessons:
         """Return the environment parameters of the current lesson: the same names in each."""
         return dict(self._lessons[self.lesson(state)].parameters)
 
+    def final_parameters(self) -> dict[str, ParameterValue]:
+        """Return the environment parameters of the last lesson."""
+        return dict(self._lessons[-1].parameters)
+
     def _pass_thresholds(self, index: int, progress: float) -> int:
         while (threshold := self._lessons[index].threshold) is not None and progress > threshold:
             index += 1

@@ -8,6 +8,8 @@ from typing import Any, Protocol
 from pydantic import BaseModel, Field
 from torch import Tensor, nn
 
+from trainers.observations import Observations
+
 
 class TrainerSettings(BaseModel, frozen=True, extra="forbid"):
     """How long to train, and how often to report and to save."""
@@ -31,6 +33,9 @@ class Algorithm(Protocol):
     """
 
     policy: nn.Module
+
+    def act(self, observations: Observations, *, deterministic: bool) -> Tensor:
+        """Actions (B, ...) for evaluation: the policy's best, or drawn as in training."""
 
     def collect(self) -> None:
         """Plays until there is enough experience for an update; changes no weights."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,10 +61,31 @@ class Episodes:
     def __len__(self) -> int:
         return len(self.rewards)
 
+    def __getitem__(self, rows: NDArray[np.bool_]) -> Episodes:
+        return Episodes(
+            self.rewards[rows],
+            self.lengths[rows],
+            {name: values[rows] for name, values in self.terms.items()},
+            {name: values[rows] for name, values in self.measures.items()},
+        )
+
     @property
     def successes(self) -> NDArray[np.bool_]:
         """(k,) False where the environment does not report success."""
         return self.measures.get(SUCCESS, np.zeros(len(self))).astype(bool)
+
+
+def concatenate(parts: Sequence[Episodes]) -> Episodes:
+    """Episodes of several batches, in their order."""
+    parts = [part for part in parts if len(part)]
+    if not parts:
+        return Episodes(np.zeros(0), np.zeros(0), {}, {})
+    return Episodes(
+        np.concatenate([part.rewards for part in parts]),
+        np.concatenate([part.lengths for part in parts]),
+        {name: np.concatenate([part.terms[name] for part in parts]) for name in parts[0].terms},
+        {n: np.concatenate([part.measures[n] for part in parts]) for n in parts[0].measures},
+    )
 
 
 class Interaction:
@@ -122,14 +143,7 @@ class Interaction:
     def take_finished(self) -> Episodes:
         """The episodes that ended since the last call."""
         parts, self._finished = self._finished, []
-        if not parts:
-            return Episodes(np.zeros(0), np.zeros(0), {}, {})
-        return Episodes(
-            np.concatenate([part.rewards for part in parts]),
-            np.concatenate([part.lengths for part in parts]),
-            {n: np.concatenate([part.terms[n] for part in parts]) for n in parts[0].terms},
-            {n: np.concatenate([part.measures[n] for part in parts]) for n in parts[0].measures},
-        )
+        return concatenate(parts)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on exactly; asked for when no finished episode waits."""

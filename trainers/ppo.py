@@ -14,6 +14,7 @@ from trainers.distributions import Distribution
 from trainers.interaction import Interaction, NonFiniteError
 from trainers.metrics import Averager
 from trainers.networks import NetworkFactory
+from trainers.observations import Observations
 from trainers.on_policy import OnPolicyCollector
 from trainers.policy import ActorCritic, PolicySettings
 from trainers.returns import explained_variance, normalize
@@ -100,6 +101,11 @@ class PPO:
         self._collector = OnPolicyCollector(self.policy, interaction, steps, generator, device)
         self._interaction = interaction
         self._rollout: Rollout | None = None
+
+    def act(self, observations: Observations, *, deterministic: bool) -> Tensor:
+        """See `Algorithm.act`."""
+        distribution = self.policy.distribution(observations)
+        return distribution.mode() if deterministic else distribution.sample(self._generator)
 
     def collect(self) -> None:
         """See `Algorithm.collect`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from trainers.checkpoint import MANIFEST, Checkpoints, Loaded
 from trainers.errors import UserError
 from trainers.files import write_atomically
 from trainers.settings import RunSettings, dump_yaml
@@ -56,3 +57,22 @@ def begin(directory: Path, run: RunSettings, *, resume: bool, force: bool) -> No
 def has_checkpoints(directory: Path) -> bool:
     """Whether a run's folder has any checkpoint."""
     return any((directory / CHECKPOINTS).glob("step-*"))
+
+
+def find_checkpoint(name: str, results_dir: Path) -> Loaded:
+    """The weights of a checkpoint's folder, of a run's folder (its best), or of a run by its id.
+
+    Raises:
+        UserError: there is none.
+    """
+    for directory in (Path(name), results_dir / name):
+        if (directory / CHECKPOINTS).is_dir():
+            return Checkpoints(directory / CHECKPOINTS, keep=1).load_best(with_state=False)
+        if (directory / MANIFEST).is_file():
+            return Checkpoints.load(directory, with_state=False)
+    raise UserError(f"{name}: neither a run nor a checkpoint, as it stands or under {results_dir}")
+
+
+def run_folder(checkpoint: Path) -> Path:
+    """The folder of the run a checkpoint belongs to."""
+    return checkpoint.resolve().parents[1]

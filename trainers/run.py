@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from pathlib import Path
 
 from trainers.algorithm import TrainerSettings
 from trainers.checkpoint import Checkpoints, Loaded
@@ -13,7 +12,7 @@ from trainers.interaction import NonFiniteError
 from trainers.metrics import RunLog
 from trainers.plugins import load_registries
 from trainers.progress import Progress, make_progress
-from trainers.results import CHECKPOINTS, begin
+from trainers.results import CHECKPOINTS, begin, find_checkpoint
 from trainers.session import Session
 from trainers.settings import dump_yaml, load_run
 from trainers.summary import Summary
@@ -119,20 +118,6 @@ def _start(
             ) from error
     session.reset()
     return None
-
-
-def find_checkpoint(name: str, results_dir: Path) -> Loaded:
-    """The weights of a checkpoint's folder, of a run's folder (its best), or of a run by its id.
-
-    Raises:
-        UserError: there is none.
-    """
-    for directory in (Path(name), results_dir / name):
-        if (directory / CHECKPOINTS).is_dir():
-            return Checkpoints(directory / CHECKPOINTS, keep=1).load_best(with_state=False)
-        if (directory / "manifest.json").is_file():
-            return Checkpoints.load(directory, with_state=False)
-    raise UserError(f"{name}: neither a run nor a checkpoint, as it stands or under {results_dir}")
 
 
 def _flags(options: argparse.Namespace) -> list[str]:

@@ -85,7 +85,7 @@ class _RunFile(BaseModel, frozen=True, extra="forbid"):
         None, description="Values or samplers of parameters that the environment lists."
     )
     trainer: dict[str, Any] = Field(description="The algorithm: its trainer_type and settings.")
-    seed: int = Field(0, ge=0, lt=2**63, description="Seed of everything that is random.")
+    seed: int = Field(0, ge=0, lt=2**32, description="Seed of everything that is random.")
     device: str = Field("cpu", min_length=1, description="Device of the networks, as torch has it.")
 
 
