@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import os
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -21,6 +22,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if shadowed := shadowed_packages():
         print(f"error: {shadowed}", file=sys.stderr)
         return MISTAKE
+    # torch's threads would otherwise spin while they wait, on the cores that simulate.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Imported late, so that `--help` and a mistyped option answer at once.
     from envs.environment import EnvironmentFailure  # noqa: PLC0415
     from trainers.errors import UserError  # noqa: PLC0415

@@ -73,9 +73,12 @@ def largest_corner_disc(leg_m: Floats, bar_m: Floats) -> Floats:
     """Radius of the largest disc where a leg and a bar meet at a right angle.
 
     It touches both outer sides and the inner corner (leg, bar), so with its centre at (r, r):
-    (r - leg)^2 + (r - bar)^2 = r^2, of which the smaller root is meant.
+    (r - leg)^2 + (r - bar)^2 = r^2, of which the smaller root is meant. Where one of the two is
+    more than twice as thick as the other, the disc fills the thick one without reaching the corner.
     """
-    return leg_m + bar_m - np.sqrt(2.0 * leg_m * bar_m)
+    thin, thick = np.minimum(leg_m, bar_m), np.maximum(leg_m, bar_m)
+    in_corner = leg_m + bar_m - np.sqrt(2.0 * leg_m * bar_m)
+    return np.where(thick > 2.0 * thin, thick / 2.0, in_corner)
 
 
 def sample_blocks(
@@ -128,7 +131,8 @@ def make_blocks(dimensions: Dimensions) -> Blocks:
     center[:, 2], half[:, 2] = leg_center * [1, -1, 1], np.where(is_u[:, None], leg_half, 0.0)
     center[half[:, :, 0] == 0.0] = 0.0
 
-    radius = largest_corner_disc(leg, bar)
+    # Where the corner's disc would reach over the far side, the face's smaller side limits it.
+    radius = np.minimum(largest_corner_disc(leg, bar), np.minimum(width, height) / 2)
     disc = np.stack([side * (width / 2 - radius), height - radius], axis=1)
     disc = np.where(has_bar[:, None], disc, np.stack([0 * height, height / 2], axis=1))
     area = half[:, :, 1] * half[:, :, 2]

@@ -28,7 +28,7 @@ class Camera(BaseModel, frozen=True, extra="forbid"):
         44.0, gt=1.0, lt=170.0, description="Horizontal field of view in degrees."
     )
     position_m: Point = Field((0.36, 0.25, 0.95), description="Optical centre, world frame.")
-    target_m: Point = Field((1.10, 0.0, 0.73), description="The point it looks at, world frame.")
+    target_m: Point = Field((1.10, 0.0, 0.75), description="The point it looks at, world frame.")
     near_m: Range = Field((0.05, 0.10), description="Near clip plane, drawn at every reset.")
     far_m: Range = Field((2.5, 3.0), description="Far clip plane, drawn at every reset.")
     range_m: Range = Field((0.4, 2.0), description="Depth only: the sensor's measuring range.")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
+import os
+import sys
 import time
 from dataclasses import dataclass
 
@@ -14,14 +17,15 @@ from encoders.spaces import DepthImage
 from envs.grasp.camera import Views, focal_length_px, sense_depth
 from envs.grasp.robot import KR16_URDF
 from envs.grasp.scene import Scenes
-from envs.grasp.settings import Support
+from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
 
 # A client costs 30 MB whatever it holds; a parked block costs a hundredth of a picture's time.
 WORLDS_PER_CLIENT = 8
 # PyBullet keeps some 10 kB of every removed body until its whole simulation is reset.
 LOADS_BEFORE_RESET = 400
-PARKED_M = (0.0, 0.0, -1000.0)
+PARKED_M = [0.0, 0.0, -1000.0]
+UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 WINDOW_POSE_S = 0.04
 
 SUPPORT_RGBA = (0.55, 0.55, 0.58, 1.0)
@@ -57,11 +61,17 @@ class PyBulletSimulator:
 
     def render(self, indices: Indices, views: Views) -> Images:
         """See `Simulator.render`."""
+        camera, matrices = (
+            views.camera,
+            zip(view_matrices(views), projection_matrices(views), strict=True),
+        )
         images = []
-        for row, index in enumerate(indices):
+        for index, (view, projection) in zip(indices, matrices, strict=True):
             client, slot = self._place(index)
-            images.append(client.render(slot, views[row : row + 1]))
-        return np.stack(images)
+            images.append(client.render(slot, camera, view, projection))
+        if camera.type == "rgb":
+            return np.stack([rgb for rgb, _ in images])
+        return buffer_to_depth(np.stack([buffer for _, buffer in images]), views)
 
     def sense(
         self, indices: Indices, views: Views, space: DepthImage, seeds: NDArray[np.uint64]
@@ -85,6 +95,7 @@ class _World:
     scene: Scenes
     joints_rad: Floats
     blocks: list[int]
+    poses: list[tuple[list[float], list[float]]]
 
 
 class _Client:
@@ -97,6 +108,8 @@ class _Client:
 
     def __init__(self, support: Support, window: bool):
         self._support = support
+        if window:
+            _require_display()
         self._pause_s = WINDOW_POSE_S if window else 0.0
         self._id = pybullet.connect(pybullet.GUI if window else pybullet.DIRECT)
         if window:
@@ -113,7 +126,9 @@ class _Client:
         if slot in self._worlds:
             for body in self._worlds[slot].blocks:
                 pybullet.removeBody(body, physicsClientId=self._id)
-        self._worlds[slot] = _World(scene, joints_rad, [])
+        positions, yaws = scene.block_position_m[0].tolist(), scene.block_yaw_rad[0].tolist()
+        poses = [(position, _turned(yaw)) for position, yaw in zip(positions, yaws, strict=True)]
+        self._worlds[slot] = _World(scene, joints_rad, [], poses)
         self._active = None if self._active == slot else self._active
         self._loads += 1
         if self._loads % LOADS_BEFORE_RESET == 0:
@@ -140,15 +155,19 @@ class _Client:
         world.joints_rad = path_rad[-1]
         return touched, collided
 
-    def render(self, slot: int, view: Views) -> Images:
+    def render(
+        self, slot: int, camera: Camera, view: list[float], projection: list[float]
+    ) -> tuple[Images, Images]:
+        """RGB (H, W, 3) and OpenGL's depth buffer (H, W) of one world."""
         self._activate(slot)
-        camera, scene = view.camera, self._worlds[slot].scene
+        scene = self._worlds[slot].scene
         intensity = float(scene.light_intensity[0])
-        image = pybullet.getCameraImage(
+        size = (camera.height, camera.width)
+        _, _, rgba, buffer, _ = pybullet.getCameraImage(
             camera.width,
             camera.height,
-            view_matrix(view),
-            projection_matrix(view),
+            view,
+            projection,
             lightDirection=scene.light_direction[0].tolist(),
             lightAmbientCoeff=1.0 - intensity,
             lightDiffuseCoeff=intensity,
@@ -158,10 +177,7 @@ class _Client:
             flags=pybullet.ER_NO_SEGMENTATION_MASK,
             physicsClientId=self._id,
         )
-        if camera.type == "rgb":
-            return np.asarray(image[2], np.uint8).reshape(camera.height, camera.width, 4)[..., :3]
-        buffer = np.asarray(image[3], np.float32).reshape(camera.height, camera.width)
-        return _buffer_to_depth(buffer, float(view.near_m[0]), float(view.far_m[0]))
+        return np.reshape(rgba, (*size, 4))[..., :3], np.reshape(buffer, size)
 
     def close(self) -> None:
         if pybullet.isConnected(self._id):
@@ -186,7 +202,7 @@ class _Client:
         low = np.array([x_low, y_low, self._support.top_m - self._support.thickness_m])
         high = np.array([x_high, y_high, self._support.top_m])
         self._table = self._add_boxes(np.zeros((1, 3)), (high - low)[None] / 2, SUPPORT_RGBA)
-        self._put(self._table, (low + high) / 2)
+        self._put(self._table, ((low + high) / 2).tolist(), UPRIGHT)
         for world in self._worlds.values():
             self._add_blocks(world)
 
@@ -199,7 +215,7 @@ class _Client:
             center, half = scene.box_center_m[0, number, used], scene.box_half_m[0, number, used]
             color = BLOCK_RGBA[number % len(BLOCK_RGBA)]
             world.blocks.append(self._add_boxes(center, half, color))
-            self._put(world.blocks[-1], PARKED_M)
+            self._put(world.blocks[-1], PARKED_M, UPRIGHT)
 
     def _add_boxes(self, center_m: Floats, half_m: Floats, rgba: tuple[float, ...]) -> int:
         """Adds one fixed body made of boxes (k, 3)."""
@@ -226,18 +242,16 @@ class _Client:
             return
         if self._active is not None:
             for body in self._worlds[self._active].blocks:
-                self._put(body, PARKED_M)
+                self._put(body, PARKED_M, UPRIGHT)
         world = self._worlds[slot]
-        for number, body in enumerate(world.blocks):
-            position = world.scene.block_position_m[0, number]
-            self._put(body, position, float(world.scene.block_yaw_rad[0, number]))
+        for body, (position_m, orientation) in zip(world.blocks, world.poses, strict=True):
+            self._put(body, position_m, orientation)
         self._set_joints(world.joints_rad)
         self._active = slot
 
-    def _put(self, body: int, position_m: Floats | tuple[float, ...], yaw_rad: float = 0.0) -> None:
-        turn = (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
+    def _put(self, body: int, position_m: list[float], orientation: list[float]) -> None:
         pybullet.resetBasePositionAndOrientation(
-            body, tuple(position_m), turn, physicsClientId=self._id
+            body, position_m, orientation, physicsClientId=self._id
         )
 
     def _set_joints(self, joints_rad: Floats) -> None:
@@ -256,37 +270,73 @@ class _Client:
         return [point[3] for point in points]
 
 
-def view_matrix(view: Views) -> list[float]:
-    """OpenGL's view matrix of the first of the views, column by column."""
+def _require_display() -> None:
+    """Asks for the display before PyBullet does, which ends the whole process without one.
+
+    Raises:
+        ValueError: there is no X server at `DISPLAY`.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError as error:
+        raise ValueError(f"no window can be opened without the library libX11: {error}") from error
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    display = x11.XOpenDisplay(None)
+    if not display:
+        where = os.environ.get("DISPLAY")
+        raise ValueError(
+            f"no window can be opened: {f'DISPLAY={where}' if where else 'DISPLAY is not set, which'}"
+            " leads to no X server; set it to one that runs, or use render_mode: rgb_array"
+        )
+    x11.XCloseDisplay(ctypes.c_void_p(display))
+
+
+def _turned(yaw_rad: float) -> list[float]:
+    """The quaternion (x, y, z, w) of a turn about the vertical."""
+    return [0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2)]
+
+
+def view_matrices(views: Views) -> list[list[float]]:
+    """OpenGL's view matrices of n views, each column by column."""
     # OpenGL's camera axes are x right, y up, z backward.
-    axes = view.rotation[0].T * np.array([[1.0], [-1.0], [-1.0]])
-    matrix = np.eye(4)
-    matrix[:3, :3] = axes
-    matrix[:3, 3] = -axes @ view.position_m[0]
-    return matrix.T.ravel().tolist()
+    axes = np.swapaxes(views.rotation, 1, 2) * np.array([[1.0], [-1.0], [-1.0]])
+    matrices = np.tile(np.eye(4), (len(views), 1, 1))
+    matrices[:, :3, :3] = axes
+    matrices[:, :3, 3] = -np.einsum("nij,nj->ni", axes, views.position_m)
+    return _columns(matrices)
 
 
-def projection_matrix(view: Views) -> list[float]:
-    """OpenGL's projection matrix of the first of the views, column by column.
+def projection_matrices(views: Views) -> list[list[float]]:
+    """OpenGL's projection matrices of n views, each column by column.
 
     TinyRenderer samples pixel (c, r) at the image point (c, r + 1), not at the pixel's centre; the
     picture is shifted by half a pixel each way to make up for it.
     """
-    camera, focal = view.camera, focal_length_px(view.camera)
-    near, far = float(view.near_m[0]), float(view.far_m[0])
-    matrix = np.array(
-        [
-            [2 * focal / camera.width, 0.0, 1.0 / camera.width, 0.0],
-            [0.0, 2 * focal / camera.height, 1.0 / camera.height, 0.0],
-            [0.0, 0.0, -(far + near) / (far - near), -2 * far * near / (far - near)],
-            [0.0, 0.0, -1.0, 0.0],
-        ]
+    camera, focal = views.camera, focal_length_px(views.camera)
+    near, far = views.near_m, views.far_m
+    matrices = np.zeros((len(views), 4, 4))
+    matrices[:, 0, 0], matrices[:, 0, 2] = 2 * focal / camera.width, 1.0 / camera.width
+    matrices[:, 1, 1], matrices[:, 1, 2] = 2 * focal / camera.height, 1.0 / camera.height
+    matrices[:, 2, 2], matrices[:, 2, 3] = (
+        -(far + near) / (far - near),
+        -2 * far * near / (far - near),
     )
-    return matrix.T.ravel().tolist()
+    matrices[:, 3, 2] = -1.0
+    return _columns(matrices)
 
 
-def _buffer_to_depth(buffer: Images, near_m: float, far_m: float) -> Images:
-    """Metres from OpenGL's depth buffer in [0, 1]; infinite where nothing was drawn."""
-    depth = far_m * near_m / (far_m - (far_m - near_m) * buffer.astype(np.float64))
+def _columns(matrices: Floats) -> list[list[float]]:
+    columns: list[list[float]] = np.swapaxes(matrices, 1, 2).reshape(-1, 16).tolist()
+    return columns
+
+
+def buffer_to_depth(buffer: Images, views: Views) -> Images:
+    """Metres (n, H, W) from OpenGL's depth buffers in [0, 1]; infinite where nothing was drawn."""
+    near = views.near_m.astype(np.float32)[:, None, None]
+    far = views.far_m.astype(np.float32)[:, None, None]
+    depth = far * near / (far - (far - near) * buffer)
     # What was never written comes back as the far plane, but for rounding.
-    return np.where(depth >= far_m * (1.0 - 1e-4), np.inf, depth).astype(np.float32)
+    depth[depth >= far * (1.0 - 1e-4)] = np.inf
+    return depth

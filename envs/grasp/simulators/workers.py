@@ -77,7 +77,15 @@ class ParallelSimulator:
             part = [a if isinstance(a, DepthImage) else a[rows] for a in arguments]
             self._workers[number].send((method, indices[rows] - self._starts[number], *part))
             busy.append(self._workers[number])
-        return [worker.receive() for worker in busy]
+        replies, failures = [], []
+        for worker in busy:  # all of them, or an answer left behind would be taken for the next one
+            try:
+                replies.append(worker.receive())
+            except SimulatorError as error:
+                failures.append(error)
+        if failures:
+            raise failures[0]
+        return replies
 
 
 class _Worker:
