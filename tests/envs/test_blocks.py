@@ -26,6 +26,7 @@ MARGIN_PX = 4
 
 def block(
     shape: int,
+    *,
     width: float = 0.2,
     height: float = 0.2,
     bar: float = 0.1,
@@ -98,10 +99,10 @@ def test_disc_is_the_largest_of_the_face_and_has_room_for_the_cup(shape: int) ->
     on_left=st.booleans(),
 )
 def test_disc_is_the_largest_for_extreme_dimensions(
-    shape: int, width: float, height: float, bar_share: float, leg_share: float, on_left: bool
+    *, shape: int, width: float, height: float, bar_share: float, leg_share: float, on_left: bool
 ) -> None:
     bar = 0.08 + bar_share * max(0.0, height / 2 - 0.08)
-    blocks = block(shape, width, height, bar, leg_share, on_left)
+    blocks = block(shape, width=width, height=height, bar=bar, leg_share=leg_share, on_left=on_left)
     assert check_disc(blocks, 0) >= DISC_RADIUS_M - TOLERANCE_M
 
 
@@ -116,7 +117,7 @@ def test_disc_is_the_largest_for_extreme_dimensions(
 def test_disc_stays_on_a_face_that_is_smaller_than_the_corners_disc(
     shape: int, width: float, height: float, bar: float, leg_share: float
 ) -> None:
-    radius = check_disc(block(shape, width, height, bar, leg_share), 0)
+    radius = check_disc(block(shape, width=width, height=height, bar=bar, leg_share=leg_share), 0)
     assert radius == pytest.approx(0.06, abs=TOLERANCE_M)
 
 
@@ -126,7 +127,7 @@ def test_discs_of_a_hand_computed_block() -> None:
     np.testing.assert_allclose(left.disc_m, [[0.1 - 0.0585786, 0.2 - 0.0585786]], atol=1e-7)
     right = block(L_SHAPE, leg_share=0.5, on_left=False)
     np.testing.assert_allclose(right.disc_m, left.disc_m * [-1, 1], atol=1e-12)
-    np.testing.assert_allclose(block(PARALLELEPIPED, 0.2, 0.14).disc_m, [[0.0, 0.07]])
+    np.testing.assert_allclose(block(PARALLELEPIPED, height=0.14).disc_m, [[0.0, 0.07]])
 
 
 @pytest.mark.parametrize("on_left", [True, False])
@@ -177,7 +178,7 @@ def test_pieces_of_an_l_and_a_u() -> None:
 
 
 def test_centroids_of_hand_computed_blocks() -> None:
-    np.testing.assert_allclose(block(PARALLELEPIPED, 0.2, 0.16).centroid_m, [[0.0, 0.08]])
+    np.testing.assert_allclose(block(PARALLELEPIPED, height=0.16).centroid_m, [[0.0, 0.08]])
     # L: bar 0.2 x 0.1 at (0, 0.15), leg 0.1 x 0.1 at (0.05, 0.05).
     np.testing.assert_allclose(block(L_SHAPE).centroid_m, [[0.05 / 3, 0.35 / 3]])
     # U: the same bar, legs 0.06 x 0.1 at z = 0.05.

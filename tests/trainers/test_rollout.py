@@ -142,6 +142,6 @@ def test_vectors_alone_need_no_frames() -> None:
 
 def test_memory_of_shared_frames_is_not_touched() -> None:
     space = Box(0, 255, (64, 64, 3), np.uint8)
-    store = FrameStore({"color": space}, capacity=10**6)  # 12 GB if it were all written to
+    store = FrameStore({"color": space}, capacity=10**5)  # 1.2 GB if it were all written to
     store.add({"color": np.ones((2, 64, 64, 3), np.uint8)}, np.arange(2))
     assert len(store.tensors(CPU)["color"]) == 2
