@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.environment import Environment
+from trainers.timers import timed
 
 SUCCESS = "success"
 
@@ -123,7 +124,8 @@ class Interaction:
         """
         if self._stop_requested():
             raise StopRequested
-        observations, reward, terminated, truncated, infos = self.env.step(actions)
+        with timed("environment"):
+            observations, reward, terminated, truncated, infos = self.env.step(actions)
         self.step_count += self.env.num_envs
         terms = infos.get("reward_terms", {})
         for name, values in {**terms, "reward": reward}.items():
@@ -156,7 +158,15 @@ class Interaction:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes back to a state."""
+        """Goes back to a state.
+
+        Raises:
+            ValueError: it is the state of another number of environments.
+        """
+        if len(state["reward"]) != self.env.num_envs:
+            raise ValueError(
+                f"it was saved with {len(state['reward'])} environments, not {self.env.num_envs}"
+            )
         self.observations = self.env.load_state_dict(state["env"])
         self.step_count = state["step_count"]
         self._reward, self._length = state["reward"].copy(), state["length"].copy()

@@ -136,10 +136,9 @@ class NetworkFactory:
     def check_name(self, name: str, path: str) -> None:
         """Refuses observations the environment does not have."""
         if name not in self.observation_space.spaces:
-            names = sorted(self.observation_space.spaces)
             raise UserError(
-                f"{path}: the environment has no observation {name!r}{suggestion(name, names)}; "
-                f"it has {names}"
+                f"{path}: the environment has no observation {name!r}; "
+                f"{suggestion(name, self.observation_space.spaces)}"
             )
 
     def network(self, settings: NetworkSettings, names: Sequence[str]) -> Network:

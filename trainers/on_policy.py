@@ -15,6 +15,7 @@ from trainers.observations import Observations, to_tensors
 from trainers.policy import ActorCritic, FrameFeatures, to_environment
 from trainers.returns import gae
 from trainers.rollout import FrameStore, Rollout, frame_spaces
+from trainers.timers import timed
 
 
 class OnPolicyCollector:
@@ -62,12 +63,14 @@ class OnPolicyCollector:
             raw = self._interaction.observations
             if images:
                 frame_of[new_frames] = frames.add(raw, new_frames)
-                features = self._encode(features, raw, new_frames)
+                with timed("encode"):
+                    features = self._encode(features, raw, new_frames)
             else:
                 frame_of = everyone + len(indices) * count
-            observations = self._vectors(raw)
-            distribution, values = self._policy(observations, features)
-            actions = distribution.sample(self._generator)
+            with timed("act"):
+                observations = self._vectors(raw)
+                distribution, values = self._policy(observations, features)
+                actions = distribution.sample(self._generator)
             step = self._interaction.step(to_environment(actions, self._action_space))
             row = {
                 "actions": actions,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from trainers.checkpoint import MANIFEST, Checkpoints, Loaded
@@ -14,25 +16,24 @@ CONFIGURATION = "configuration.yaml"
 CHECKPOINTS = "checkpoints"
 
 
-def begin(directory: Path, run: RunSettings, *, resume: bool, force: bool) -> None:
-    """Makes a run's folder ready, and writes the resolved run file into it.
+def check(directory: Path, *, resume: bool, force: bool) -> None:
+    """Sees whether a run may have a folder; changes nothing.
 
     Args:
         directory: the run's folder.
-        run: what is going to run.
         resume: go on with the run that is there.
-        force: delete the run that is there.
+        force: replace the run that is there.
 
     Raises:
-        UserError: the folder is taken, has nothing to resume, or can't be written.
+        UserError: the folder is taken, has nothing to resume, or can't be read.
     """
-    try:
-        taken = directory.exists() and any(directory.iterdir())
-        if resume and not has_checkpoints(directory):
-            raise UserError(
-                f"{directory}: there is no checkpoint to resume; start the run without --resume"
-            )
-        if taken and not resume:
+    with _blaming_the_results_dir(directory):
+        if resume:
+            if not has_checkpoints(directory):
+                raise UserError(
+                    f"{directory}: there is no checkpoint to resume; start the run without --resume"
+                )
+        elif directory.exists() and any(directory.iterdir()):
             if not force:
                 raise UserError(
                     f"{directory}: this run exists already: go on with it (--resume), replace it "
@@ -43,9 +44,32 @@ def begin(directory: Path, run: RunSettings, *, resume: bool, force: bool) -> No
                     f"{directory}: --force deletes runs, and this is none (it has no "
                     f"{CONFIGURATION}); choose another --run-id"
                 )
+
+
+def begin(directory: Path, run: RunSettings, *, resume: bool) -> None:
+    """Makes a run's folder ready, and writes the resolved run file into it.
+
+    Comes after `check`, and as late as can be: what it replaces is gone.
+
+    Args:
+        directory: the run's folder.
+        run: what is going to run.
+        resume: keep what is there.
+
+    Raises:
+        UserError: the folder can't be written.
+    """
+    with _blaming_the_results_dir(directory):
+        if directory.exists() and not resume:
             shutil.rmtree(directory)
         directory.mkdir(parents=True, exist_ok=True)
         write_atomically(directory / CONFIGURATION, dump_yaml(run))
+
+
+@contextmanager
+def _blaming_the_results_dir(directory: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         where = error.filename or directory
         raise UserError(

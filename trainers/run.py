@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
 
 from trainers.algorithm import TrainerSettings
 from trainers.checkpoint import Checkpoints, Loaded
 from trainers.errors import UserError
+from trainers.files import write_atomically
 from trainers.interaction import NonFiniteError
 from trainers.metrics import RunLog
 from trainers.plugins import load_registries
 from trainers.progress import Progress, make_progress
-from trainers.results import CHECKPOINTS, begin, find_checkpoint
+from trainers.results import CHECKPOINTS, begin, check, find_checkpoint
 from trainers.session import Session
 from trainers.settings import dump_yaml, load_run
 from trainers.summary import Summary
+from trainers.timers import Timer, recording
 from trainers.training import train
+
+TIMERS = "timers.json"
 
 
 def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) -> bool:
@@ -41,25 +48,33 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
     run_id = options.run_id or options.config.stem
     directory = options.results_dir / run_id
     checkpoints = Checkpoints(directory / CHECKPOINTS, settings.keep_checkpoints)
-    session = Session(run, registries, stop_requested)
-    try:
-        begin(directory, run, resume=options.resume, force=options.force)
+    check(directory, resume=options.resume, force=options.force)
+    with closing(Session(run, registries, stop_requested)) as session:
+        # Nothing is replaced before it is certain that the run can begin.
         resumed = _start(session, options, checkpoints)
-        start_step = session.interaction.step_count
-        log = RunLog(directory, start_step if resumed else None)
-        try:
-            log.text("configuration", f"```yaml\n{dump_yaml(run)}```", start_step)
-            summary = Summary(log, run_id, settings.max_steps, settings.summary_freq, start_step)
-            with make_progress(
-                run_id, settings.max_steps, session.lesson_count, start_step
-            ) as progress:
-                for note in resumed.notes if resumed else ():
-                    progress.message(note)
-                return _train(session, settings, summary, checkpoints, progress)
-        finally:
-            log.close()
+        begin(directory, run, resume=options.resume)
+        start = session.interaction.step_count
+        with (
+            closing(RunLog(directory, start if resumed else None)) as log,
+            make_progress(run_id, settings.max_steps, session.lesson_count, start) as progress,
+            _timers_written(directory),
+        ):
+            log.text("configuration", f"```yaml\n{dump_yaml(run)}```", start)
+            for note in resumed.notes if resumed else ():
+                progress.message(note)
+            summary = Summary(log, run_id, settings.max_steps, settings.summary_freq, start)
+            return _train(session, settings, summary, checkpoints, progress)
+
+
+@contextmanager
+def _timers_written(directory: Path) -> Iterator[None]:
+    """Records where the time goes, and leaves it in the run's folder however the run ends."""
+    root = Timer()
+    try:
+        with recording(root):
+            yield
     finally:
-        session.close()
+        write_atomically(directory / TIMERS, json.dumps(root.tree(), indent=2) + "\n")
 
 
 def _train(

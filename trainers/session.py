@@ -134,9 +134,8 @@ class Session:
         for path, parameters in sources.items():
             for name in sorted(set(parameters) - env.parameter_names):
                 raise UserError(
-                    f"{path}: the environment has no parameter {name!r}"
-                    f"{suggestion(name, env.parameter_names)}; it has "
-                    f"{sorted(env.parameter_names) or 'none'}"
+                    f"{path}: the environment has no parameter {name!r}; "
+                    f"{suggestion(name, env.parameter_names)}"
                 )
 
 

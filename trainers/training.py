@@ -12,6 +12,7 @@ from trainers.interaction import StopRequested
 from trainers.progress import Progress
 from trainers.session import Session
 from trainers.summary import Summary
+from trainers.timers import timed
 
 
 def train(
@@ -37,14 +38,16 @@ def train(
         # Between an update and the next collection is where a run can be taken up again.
         step, boundary = interaction.step_count, session.state_dict()
         try:
-            algorithm.collect()
+            with timed("collect"):
+                algorithm.collect()
         except (StopRequested, EnvironmentFailure) as stop:
             _save(session, checkpoints, step, boundary, summary.score)
             if isinstance(stop, StopRequested):
                 return False
             raise
         share = min(interaction.step_count / max_steps, 1.0)
-        summary.add(algorithm.update(share))
+        with timed("update"):
+            summary.add(algorithm.update(share))
         episodes = interaction.take_finished()
         summary.add_episodes(episodes)
         if session.advance_curriculum(episodes, share):
@@ -52,7 +55,8 @@ def train(
                 f"step {interaction.step_count}: lesson {session.lesson + 1} of "
                 f"{session.lesson_count} begins"
             )
-        summary.report(session, progress)
+        with timed("summary"):
+            summary.report(session, progress)
         if interaction.step_count - saved_at >= settings.checkpoint_interval:
             saved_at = interaction.step_count
             path = _save(session, checkpoints, saved_at, session.state_dict(), summary.score)
@@ -68,4 +72,5 @@ def _save(
     state: dict[str, Any],
     score: float | None,
 ) -> Path:
-    return checkpoints.save(step, session.weights(), {"step": step, **state}, score)
+    with timed("checkpoint"):
+        return checkpoints.save(step, session.weights(), {"step": step, **state}, score)

@@ -104,4 +104,5 @@ class GraspEnv(gymnasium.Env[Any, NDArray[Any]]):
 
 
 def _first(observations: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    return {name: values[0] for name, values in observations.items()}
+    """The only environment's observations, copied: the user may write to them."""
+    return {name: values[0].copy() for name, values in observations.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import gymnasium
@@ -13,21 +14,18 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from curricula.samplers import ParameterValue, draw
-from encoders.spaces import DepthImage, RgbImage
+from encoders.spaces import DepthImage
 from envs.environment import Environment, Observations, StepResult
 from envs.grasp.camera import Views, sample_views
+from envs.grasp.episodes import Episodes
+from envs.grasp.observations import PRIVILEGED, observation_space, privileged_state
 from envs.grasp.scene import Scenes, SceneSampler
 from envs.grasp.settings import Camera, GraspSettings
 from envs.grasp.simulators.factory import make_simulator
-from envs.grasp.task import Arm, GoalRegion, Motion, Progress, Tools, advance, judge
+from envs.grasp.task import Arm, GoalRegion, Motion, Progress, advance, judge
 from rewards.reward import RewardTerm, weigh
 from rewards.transition import Transition
 
-PRIVILEGED = "privileged"
-PRIVILEGED_SIZE = 22
-# Brings the privileged numbers near 1: positions are decimetres off the workspace's middle.
-WORKSPACE_MIDDLE_M = np.array([1.05, 0.0, 0.75])
-DECIMETRES_PER_M = 10.0
 OVERVIEW = Camera(
     type="rgb",
     width=640,
@@ -81,10 +79,10 @@ class GraspVectorEnv(Environment):
         self._parameters: dict[str, ParameterValue] = {}
         self._arm = Arm(settings.workspace, settings.motion_checks)
         self._sampler = SceneSampler(settings)
-        self._goal = GoalRegion.like(settings.goal, self.num_envs)
+        self._everyone = np.arange(self.num_envs)
+        self._episodes: Episodes | None = None
         self._rng = np.random.default_rng(seed)
         self._simulator = make_simulator(settings, self.num_envs, render_mode == "human")
-        self._begun = False
 
     # -- gymnasium's interface -------------------------------------------------------------------
 
@@ -95,7 +93,7 @@ class GraspVectorEnv(Environment):
         if seed is not None:
             self._rng = np.random.default_rng(seed)
         mask = (options or {}).get("reset_mask")
-        if mask is None or not self._begun:
+        if mask is None or self._episodes is None:
             mask = np.ones(self.num_envs, bool)
         self._begin(np.flatnonzero(mask))
         return self._observations(), {}
@@ -122,9 +120,8 @@ class GraspVectorEnv(Environment):
         transition = self._move(actions)
         terms = weigh(self._rewards, transition)
         terminated = transition.rotation_right
-        truncated = ~terminated & (self._progress.steps >= self._settings.episode_steps)
-        if not self._settings.frame_grab:
-            self._take_pictures(np.arange(self.num_envs))
+        steps = self._running().progress.steps
+        truncated = ~terminated & (steps >= self._settings.episode_steps)
         infos = {
             "reward_terms": terms,
             "measures": self._measures(transition),
@@ -139,7 +136,7 @@ class GraspVectorEnv(Environment):
             return None
         still = np.random.default_rng(0)
         views = sample_views(OVERVIEW, still, self.num_envs, position_m=0.0, rotation_deg=0.0)
-        return tuple(self._simulator.render(np.arange(self.num_envs), views))
+        return tuple(self._simulator.render(self._everyone, views))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the simulator."""
@@ -154,30 +151,13 @@ class GraspVectorEnv(Environment):
 
     def state_dict(self) -> dict[str, Any]:
         """See `Environment.state_dict`."""
-        return {
-            "rng": self._rng.bit_generator.state,
-            "scenes": self._scenes.arrays(),
-            "views": {name: views.arrays() for name, views in self._views.items()},
-            "tools": self._tools.arrays(),
-            "region": self._region.arrays(),
-            "progress": self._progress.arrays(),
-            "images": dict(self._images),
-        }
+        return {"rng": self._rng.bit_generator.state, **self._running().state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> Observations:
         """See `Environment.load_state_dict`."""
         self._rng.bit_generator.state = state["rng"]
-        self._scenes = Scenes(**state["scenes"])
-        self._views = {
-            name: Views(camera, **state["views"][name])
-            for name, camera in self._settings.cameras.items()
-        }
-        self._tools = Tools(**state["tools"])
-        self._region = GoalRegion(**state["region"])
-        self._progress = Progress(**state["progress"])
-        self._images = dict(state["images"])
-        self._begun = True
-        self._simulator.load(np.arange(self.num_envs), self._scenes, self._tools.joints_rad)
+        self._episodes = episodes = Episodes.from_state_dict(state, self._settings.cameras)
+        self._simulator.load(self._everyone, episodes.scenes, episodes.tools.joints_rad)
         return self._observations()
 
     # -- the task --------------------------------------------------------------------------------
@@ -185,100 +165,74 @@ class GraspVectorEnv(Environment):
     @property
     def scenes(self) -> Scenes:
         """The running episodes' scenes."""
-        return self._scenes
+        return self._running().scenes
 
     def action_for(self, tooltip_m: NDArray[Any], yaw_rad: NDArray[Any]) -> NDArray[np.float64]:
         """The actions (N, 4) that lead to tooltips (N, 3) and yaws (N,)."""
         return self._arm.action(tooltip_m, yaw_rad)
 
+    def _running(self) -> Episodes:
+        if self._episodes is None:
+            raise gymnasium.error.ResetNeeded("call reset() first: no episode has begun yet")
+        return self._episodes
+
     def _move(self, actions: NDArray[np.float64]) -> Transition:
-        """Moves all robots, and brings the episodes' progress up to date."""
-        before = self._tools
-        after, path, duration_s = self._arm.reach(before, actions)
-        contacts = self._simulator.move(np.arange(self.num_envs), path)
-        motion = Motion(before, after, duration_s, contacts)
-        transition = judge(motion, self._scenes, self._region, self._progress)
-        self._tools, self._progress = after, advance(self._progress, transition)
+        """Moves all robots, and brings the episodes up to date."""
+        episodes = self._running()
+        after, path, duration_s = self._arm.reach(episodes.tools, actions)
+        contacts = self._simulator.move(self._everyone, path)
+        motion = Motion(episodes.tools, after, duration_s, contacts)
+        transition = judge(motion, episodes.scenes, episodes.region, episodes.progress)
+        images = episodes.images
+        if not self._settings.frame_grab:
+            images = self._pictures(self._everyone, episodes.views)
+        progress = advance(episodes.progress, transition)
+        self._episodes = replace(episodes, tools=after, progress=progress, images=images)
         return transition
 
     def _begin(self, indices: NDArray[np.int64]) -> None:
-        """Begins new episodes in some environments.
-
-        What observations were made of is replaced, never written to: they may still be in use.
-        """
+        """Begins new episodes in some environments."""
         n = len(indices)
-        goal = GoalRegion.like(self._settings.goal, n)
         given = {name: draw(value, self._rng, n) for name, value in self._parameters.items()}
-        region = goal.with_arrays({name: given[name] for name in GOAL_PARAMETERS if name in given})
+        limits = {name: given[name] for name in GOAL_PARAMETERS if name in given}
         yaw_limit_rad = np.radians(given.get("block_yaw_limit_deg", np.full(n, 180.0)))
         scenes, views = self._sampler.sample(self._rng, yaw_limit_rad)
         if "noise_sigma_m" in given:
             sigma_m = np.maximum(given["noise_sigma_m"], 0.0)
-            views = {n: view.with_arrays({"noise_sigma_m": sigma_m}) for n, view in views.items()}
-        tools, progress = self._arm.home(n), Progress.start(n)
-        if self._begun:
-            self._scenes = self._scenes.with_rows(indices, scenes)
-            self._views = {
-                name: self._views[name].with_rows(indices, view) for name, view in views.items()
-            }
-            self._region = self._region.with_rows(indices, region)
-            self._tools = self._tools.with_rows(indices, tools)
-            self._progress = self._progress.with_rows(indices, progress)
-        else:
-            self._scenes, self._views, self._region = scenes, views, region
-            self._tools, self._progress = tools, progress
-            self._images = {
-                name: np.zeros((n, *space.shape), space.dtype)
-                for name, space in self._image_spaces().items()
-            }
-            self._begun = True
+            views = {k: view.with_arrays({"noise_sigma_m": sigma_m}) for k, view in views.items()}
+        tools = self._arm.home(n)
         self._simulator.load(indices, scenes, tools.joints_rad)
-        self._take_pictures(indices)
+        begun = Episodes(
+            scenes=scenes,
+            region=GoalRegion.like(self._settings.goal, n).with_arrays(limits),
+            tools=tools,
+            progress=Progress.start(n),
+            views=views,
+            images=self._pictures(indices, views),
+        )
+        whole = self._episodes is None
+        self._episodes = begun if whole else self._running().with_rows(indices, begun)
 
-    def _take_pictures(self, indices: NDArray[np.int64]) -> None:
-        for name, space in self._image_spaces().items():
-            views = self._views[name][indices]
-            pictures: NDArray[Any]
+    def _pictures(
+        self, indices: NDArray[np.int64], views: Mapping[str, Views]
+    ) -> dict[str, NDArray[Any]]:
+        """What each camera observes now in some worlds, (n, H, W, C) by its name."""
+        pictures: dict[str, NDArray[Any]] = {}
+        for name, view in views.items():
+            space = self.single_observation_space[name]
             if isinstance(space, DepthImage):
                 seeds = self._rng.integers(2**63, size=len(indices), dtype=np.uint64)
-                pictures = self._simulator.sense(indices, views, space, seeds)
+                pictures[name] = self._simulator.sense(indices, view, space, seeds)
             else:
-                pictures = self._simulator.render(indices, views)
-            self._images[name] = _with_rows(self._images[name], indices, pictures)
-
-    def _image_spaces(self) -> dict[str, Any]:
-        spaces = self.single_observation_space.spaces
-        return {name: spaces[name] for name in self._settings.cameras}
+                pictures[name] = self._simulator.render(indices, view)
+        return pictures
 
     def _observations(self) -> Observations:
-        observations: Observations = dict(self._images)
+        episodes = self._running()
+        observations: Observations = dict(episodes.images)
         if self._settings.privileged:
-            observations[PRIVILEGED] = self._privileged()
+            observations[PRIVILEGED] = privileged_state(episodes, self._settings.episode_steps)
         return observations
-
-    def _privileged(self) -> NDArray[np.float32]:
-        """True state (N, 22): tool and target pose, goal limits, the episode's progress."""
-        scenes, tools, region, progress = self._scenes, self._tools, self._region, self._progress
-        yaw = scenes.target_yaw_rad
-        columns = [
-            (tools.tooltip_m - WORKSPACE_MIDDLE_M) * DECIMETRES_PER_M,
-            np.sin(tools.yaw_rad),
-            tools.axis[:, 2],
-            (scenes.target_m - WORKSPACE_MIDDLE_M) * DECIMETRES_PER_M,
-            np.sin(yaw),
-            (tools.tooltip_m - scenes.target_m) * DECIMETRES_PER_M,
-            np.sin(tools.yaw_rad - yaw),
-            region.lateral_limit_m * DECIMETRES_PER_M,
-            region.vertical_limit_m * DECIMETRES_PER_M,
-            region.gap_limit_m * DECIMETRES_PER_M,
-            np.radians(region.yaw_limit_deg) * DECIMETRES_PER_M,
-            progress.steps / self._settings.episode_steps,
-            progress.steps == 0,
-            progress.touched,
-            progress.position_right,
-            progress.rotation_right,
-        ]
-        return np.column_stack(columns).astype(np.float32)
 
     def _measures(self, transition: Transition) -> dict[str, NDArray[Any]]:
         """What to report: errors to the middle of the final goal region, and how it went."""
@@ -287,30 +241,10 @@ class GraspVectorEnv(Environment):
         error = np.abs(transition.offset_m - middle)
         return {
             "success": transition.rotation_right,
-            "collision": self._progress.collided,
+            "collision": self._running().progress.collided,
             "position_error_m": np.linalg.norm(error, axis=1),
             "position_error_x_m": error[:, 0],
             "position_error_y_m": error[:, 1],
             "position_error_z_m": error[:, 2],
             "yaw_error_deg": np.degrees(np.abs(transition.yaw_error_rad)),
         }
-
-
-def observation_space(settings: GraspSettings) -> gymnasium.spaces.Dict:
-    """The space of one environment's observations."""
-    spaces: dict[str, gymnasium.Space[Any]] = {}
-    for name, camera in settings.cameras.items():
-        if camera.type == "depth":
-            spaces[name] = DepthImage(camera.height, camera.width, camera.range_m, camera.encoding)
-        else:
-            spaces[name] = RgbImage(camera.height, camera.width)
-    if settings.privileged:
-        spaces[PRIVILEGED] = Box(-np.inf, np.inf, (PRIVILEGED_SIZE,), np.float32)
-    return gymnasium.spaces.Dict(spaces)
-
-
-def _with_rows(array: NDArray[Any], indices: NDArray[np.int64], rows: NDArray[Any]) -> NDArray[Any]:
-    """A copy of an array with other rows at `indices`."""
-    copy = array.copy()
-    copy[indices] = rows
-    return copy

@@ -20,8 +20,9 @@ from envs.grasp.scene import Scenes
 from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
 
-# A client costs 30 MB whatever it holds; a parked block costs a hundredth of a picture's time.
-WORLDS_PER_CLIENT = 8
+# A client costs 30 MB whatever it holds, so worlds share them; but every block that is parked while
+# another world has its turn costs some microseconds of each picture.
+CLIENTS_PER_PROCESS = 8
 # PyBullet keeps some 10 kB of every removed body until its whole simulation is reset.
 LOADS_BEFORE_RESET = 400
 PARKED_M = [0.0, 0.0, -1000.0]
@@ -42,7 +43,8 @@ class PyBulletSimulator:
     """
 
     def __init__(self, num_worlds: int, support: Support, window: bool = False):
-        count = math.ceil(num_worlds / WORLDS_PER_CLIENT)
+        self._worlds_per_client = math.ceil(num_worlds / CLIENTS_PER_PROCESS)
+        count = math.ceil(num_worlds / self._worlds_per_client)
         self._clients = [_Client(support, window and number == 0) for number in range(count)]
 
     def load(self, indices: Indices, scenes: Scenes, joints_rad: Floats) -> None:
@@ -85,7 +87,8 @@ class PyBulletSimulator:
             self._clients.pop().close()
 
     def _place(self, index: int) -> tuple[_Client, int]:
-        return self._clients[index // WORLDS_PER_CLIENT], int(index % WORLDS_PER_CLIENT)
+        client, slot = divmod(int(index), self._worlds_per_client)
+        return self._clients[client], slot
 
 
 @dataclass
@@ -287,8 +290,8 @@ def _require_display() -> None:
     if not display:
         where = os.environ.get("DISPLAY")
         raise ValueError(
-            f"no window can be opened: {f'DISPLAY={where}' if where else 'DISPLAY is not set, which'}"
-            " leads to no X server; set it to one that runs, or use render_mode: rgb_array"
+            f"no window can be opened: {f'DISPLAY={where}' if where else 'DISPLAY is not set and'} "
+            "leads to no X server; set it to one that runs, or use render_mode: rgb_array"
         )
     x11.XCloseDisplay(ctypes.c_void_p(display))
 

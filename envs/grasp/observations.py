@@ -1,0 +1,58 @@
+"""What the grasp environment lets be observed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+from encoders.spaces import DepthImage, RgbImage
+from envs.grasp.episodes import Episodes
+from envs.grasp.settings import GraspSettings
+
+PRIVILEGED = "privileged"
+PRIVILEGED_SIZE = 22
+# Brings the privileged numbers near 1: positions are decimetres off the workspace's middle.
+WORKSPACE_MIDDLE_M = np.array([1.05, 0.0, 0.75])
+DECIMETRES_PER_M = 10.0
+
+
+def observation_space(settings: GraspSettings) -> gymnasium.spaces.Dict:
+    """The space of one environment's observations."""
+    spaces: dict[str, gymnasium.Space[Any]] = {}
+    for name, camera in settings.cameras.items():
+        if camera.type == "depth":
+            spaces[name] = DepthImage(camera.height, camera.width, camera.range_m, camera.encoding)
+        else:
+            spaces[name] = RgbImage(camera.height, camera.width)
+    if settings.privileged:
+        spaces[PRIVILEGED] = Box(-np.inf, np.inf, (PRIVILEGED_SIZE,), np.float32)
+    return gymnasium.spaces.Dict(spaces)
+
+
+def privileged_state(episodes: Episodes, episode_steps: int) -> NDArray[np.float32]:
+    """True state (N, 22): tool and target pose, goal limits, the episode's progress."""
+    scenes, tools, region = episodes.scenes, episodes.tools, episodes.region
+    progress, yaw = episodes.progress, episodes.scenes.target_yaw_rad
+    columns = [
+        (tools.tooltip_m - WORKSPACE_MIDDLE_M) * DECIMETRES_PER_M,
+        np.sin(tools.yaw_rad),
+        tools.axis[:, 2],
+        (scenes.target_m - WORKSPACE_MIDDLE_M) * DECIMETRES_PER_M,
+        np.sin(yaw),
+        (tools.tooltip_m - scenes.target_m) * DECIMETRES_PER_M,
+        np.sin(tools.yaw_rad - yaw),
+        region.lateral_limit_m * DECIMETRES_PER_M,
+        region.vertical_limit_m * DECIMETRES_PER_M,
+        region.gap_limit_m * DECIMETRES_PER_M,
+        np.radians(region.yaw_limit_deg) * DECIMETRES_PER_M,
+        progress.steps / episode_steps,
+        progress.steps == 0,
+        progress.touched,
+        progress.position_right,
+        progress.rotation_right,
+    ]
+    return np.column_stack(columns).astype(np.float32)
