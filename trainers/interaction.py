@@ -132,6 +132,8 @@ class Interaction:
             self._check(f"reward {name!r}" if name != "reward" else "reward", values)
         self._check_observations(observations)
         done = terminated | truncated
+        final = infos.get("final_obs") if done.any() else None
+        self._check_observations(final or {}, done)
         self._add_up(reward, terms, infos.get("measures", {}), done)
         self.observations = observations
         return Step(
@@ -139,7 +141,7 @@ class Interaction:
             terminated,
             truncated,
             infos.get("same_frame", np.zeros(len(reward), bool)),
-            infos.get("final_obs") if done.any() else None,
+            final,
         )
 
     def take_finished(self) -> Episodes:
@@ -196,16 +198,21 @@ class Interaction:
             for total in (self._reward, self._length, *self._terms.values()):
                 total[done] = 0.0
 
-    def _check_observations(self, observations: Mapping[str, NDArray[Any]]) -> None:
+    def _check_observations(
+        self, observations: Mapping[str, NDArray[Any]], of: NDArray[np.bool_] | None = None
+    ) -> None:
         for name, values in observations.items():
             if np.issubdtype(values.dtype, np.floating):
-                self._check(f"observation {name!r}", values)
+                self._check(f"observation {name!r}", values, of)
 
-    def _check(self, what: str, values: NDArray[Any]) -> None:
-        finite = np.isfinite(values)
-        if not finite.all():
-            environment = int(np.argwhere(~finite)[0][0])
-            value = np.asarray(values)[~finite].flat[0]
+    def _check(self, what: str, values: NDArray[Any], of: NDArray[np.bool_] | None = None) -> None:
+        """Refuses what is not finite, in all environments or in those where `of` (N,) is set."""
+        broken = ~np.isfinite(values)
+        if of is not None:
+            broken[~of] = False
+        if broken.any():
+            environment = int(np.argwhere(broken)[0][0])
+            value = np.asarray(values)[broken].flat[0]
             raise NonFiniteError(
                 f"step {self.step_count}: the {what} of environment {environment} is {value}"
             )

@@ -67,7 +67,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--results-dir", type=Path, default=Path("results"), help="where runs are kept"
     )
-    return parser.parse_intermixed_args(arguments)
+    options = parser.parse_intermixed_args(arguments)
+    if options.resume and options.initialize_from:
+        parser.error("--resume goes on with the run's own weights: leave --initialize-from out")
+    return options
 
 
 class Stop:

@@ -98,13 +98,6 @@ def project(views: Views, points_m: Floats) -> Floats:
     return np.stack([u, v, depth], axis=-1)
 
 
-def in_view(views: Views, points_m: Floats) -> NDArray[np.bool_]:
-    """Whether all the points (n, k, 3) of an environment lie inside its image: (n,)."""
-    u, v, depth = np.moveaxis(project(views, points_m), -1, 0)
-    inside = (u >= 0) & (u <= views.camera.width) & (v >= 0) & (v <= views.camera.height)
-    return np.asarray((inside & (depth > 0)).all(axis=1))
-
-
 def sense_depth(
     depth_m: NDArray[np.float32],
     space: DepthImage,

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
+
 import cv2
 import numpy as np
 import pytest
@@ -9,12 +11,11 @@ from hypothesis import strategies as st
 from envs.grasp.blocks import (
     DISC_RADIUS_M,
     L_SHAPE,
+    MAX_BAR_SHARE,
+    MIN_BAR_M,
     PARALLELEPIPED,
     U_SHAPE,
-    Blocks,
-    Dimensions,
-    make_blocks,
-    sample_blocks,
+    build_block,
 )
 
 SHAPES = [PARALLELEPIPED, L_SHAPE, U_SHAPE]
@@ -24,31 +25,76 @@ TOLERANCE_M = 1.5 * PIXEL_M
 MARGIN_PX = 4
 
 
+@dataclass(frozen=True)
+class Blocks:
+    """n blocks as `build_block` gives them."""
+
+    center_m: np.ndarray
+    half_m: np.ndarray
+    disc_m: np.ndarray
+    centroid_m: np.ndarray
+    size_m: np.ndarray
+
+
+def built(rows: list[tuple[int, tuple[float, float, float], float, float, bool]]) -> Blocks:
+    center, half = np.full((2, len(rows), 3, 3), np.nan)
+    points = np.array(
+        [
+            build_block(shape, np.array(size), bar, share, left, center[row], half[row])
+            for row, (shape, size, bar, share, left) in enumerate(rows)
+        ]
+    )
+    sizes = np.array([size for _, size, *_ in rows])
+    return Blocks(center, half, points[:, :2], points[:, 2:], sizes)
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Built blocks: boxes (n, 3, 3), grasp points (n, 2) and size (n, 3)."""
+
+    center_m: np.ndarray
+    half_m: np.ndarray
+    disc_m: np.ndarray
+    centroid_m: np.ndarray
+    size_m: np.ndarray
+
+
 def block(
     shape: int,
     *,
     width: float = 0.2,
     height: float = 0.2,
+    depth: float = 0.1,
     bar: float = 0.1,
     leg_share: float = 0.5,
     on_left: bool = True,
 ) -> Blocks:
-    return make_blocks(
-        Dimensions(
-            shape=np.array([shape]),
-            width_m=np.array([width]),
-            height_m=np.array([height]),
-            depth_m=np.array([0.1]),
-            bar_m=np.array([bar]),
-            leg_share=np.array([leg_share]),
-            leg_on_left=np.array([on_left]),
-        )
+    center, half, size = np.ones((3, 3)), np.ones((3, 3)), np.array([depth, width, height])
+    points = build_block(shape, size, bar, leg_share, on_left, center, half)
+    return Blocks(
+        center[None], half[None], *np.array([points[:2], points[2:]])[:, None], size[None]
     )
 
 
-def sampled(shape: int, count: int, seed: int = 0) -> Blocks:
+def random_blocks(shape: int, count: int, seed: int = 0) -> Blocks:
     rng = np.random.default_rng(seed)
-    return sample_blocks(rng, np.full(count, shape), (0.12, 0.24), (0.08, 0.12))
+    built = []
+    for _ in range(count):
+        width, height = rng.uniform(0.12, 0.24, 2)
+        built.append(
+            block(
+                shape,
+                width=width,
+                height=height,
+                depth=rng.uniform(0.08, 0.12),
+                bar=rng.uniform(MIN_BAR_M, max(MIN_BAR_M, MAX_BAR_SHARE * height)),
+                leg_share=rng.random(),
+                on_left=rng.random() < 0.5,
+            )
+        )
+    return Blocks(
+        *(np.concatenate([getattr(one, field.name) for one in built]) for field in fields(Blocks))
+    )
 
 
 def rectangles(blocks: Blocks, row: int) -> tuple[np.ndarray, np.ndarray]:
@@ -84,7 +130,7 @@ def check_disc(blocks: Blocks, row: int) -> float:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_disc_is_the_largest_of_the_face_and_has_room_for_the_cup(shape: int) -> None:
-    blocks = sampled(shape, 60)
+    blocks = random_blocks(shape, 60)
     for row in range(60):
         assert check_disc(blocks, row) >= DISC_RADIUS_M - TOLERANCE_M
 
@@ -145,7 +191,7 @@ def test_of_a_us_two_discs_the_left_one_is_meant(on_left: bool) -> None:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_boxes_are_disjoint_and_fill_the_blocks_outline(shape: int) -> None:
-    blocks = sampled(shape, 200)
+    blocks = random_blocks(shape, 200)
     depth, width, height = blocks.size_m.T
     for row in range(200):
         low, high = rectangles(blocks, row)
@@ -189,24 +235,9 @@ def test_centroids_of_hand_computed_blocks() -> None:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_centroid_agrees_with_random_points_of_the_face(shape: int) -> None:
-    blocks, rng = sampled(shape, 5, seed=1), np.random.default_rng(0)
+    blocks, rng = random_blocks(shape, 5, seed=1), np.random.default_rng(0)
     for row in range(5):
         low, high = rectangles(blocks, row)
         points = rng.uniform(low.min(0), high.max(0), (200_000, 2))
         inside = ((points[:, None] >= low) & (points[:, None] <= high)).all(-1).any(-1)
         np.testing.assert_allclose(points[inside].mean(0), blocks.centroid_m[row], atol=8e-4)
-
-
-def test_sampled_dimensions_use_their_whole_range() -> None:
-    blocks = sampled(L_SHAPE, 2000)
-    for column, (low, high) in enumerate([(0.08, 0.12), (0.12, 0.24), (0.12, 0.24)]):
-        values = blocks.size_m[:, column]
-        assert low <= values.min() < low + 0.02 * (high - low)
-        assert high - 0.02 * (high - low) < values.max() <= high
-    legs = 2 * blocks.half_m[:, 1, 1] / blocks.size_m[:, 1]
-    assert 0.4 <= legs.min() < 0.41
-    assert 0.59 < legs.max() <= 0.6
-    bars = 2 * blocks.half_m[:, 0, 2]
-    assert 0.08 <= bars.min() < 0.0805
-    assert 0.115 < bars.max() <= 0.12
-    assert 0.45 < (blocks.disc_m[:, 0] > 0).mean() < 0.55  # legs on either side

@@ -7,7 +7,6 @@ from encoders.spaces import DepthImage
 from envs.grasp.camera import (
     Views,
     focal_length_px,
-    in_view,
     look_at,
     project,
     sample_views,
@@ -46,27 +45,6 @@ def test_project_takes_each_environments_own_camera() -> None:
     views = fixed(FORWARD, 2).with_arrays({"position_m": np.array([(1.0, 2, 3), (2.0, 2, 3)])})
     points = np.tile([3.0, 1.0, 3.0], (2, 1, 1))
     np.testing.assert_allclose(project(views, points), [[(75, 30, 2)], [(100, 30, 1)]])
-
-
-@pytest.mark.parametrize(
-    ("point", "seen"),
-    [
-        ((2, 2, 3), True),
-        ((2, 1.01, 3), True),
-        ((2, 0.99, 3), False),
-        ((2, 2.99, 3), True),
-        ((2, 3.01, 3), False),
-        ((2, 2, 3.59), True),
-        ((2, 2, 3.61), False),
-        ((2, 2, 2.41), True),
-        ((2, 2, 2.39), False),
-        ((0, 2, 3), False),  # behind
-        ((1, 2, 3), False),  # in the optical centre
-    ],
-)
-def test_in_view_borders(point: tuple[float, ...], seen: bool) -> None:
-    inside = np.array([[(3.0, 2.0, 3.0), point]])
-    assert in_view(fixed(FORWARD), inside).tolist() == [seen]
 
 
 @pytest.mark.parametrize(

@@ -582,6 +582,18 @@ def test_a_state_can_be_gone_back_to_in_the_same_environment(make: MakeEnv) -> N
     same(play(env, 6, 1), expected)
 
 
+def test_the_robots_stand_where_the_state_has_them() -> None:
+    settings = GraspSettings(num_envs=2, workers=0, cameras=SMALL)
+    env = GraspVectorEnv(settings, [], render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(np.zeros((2, 4)))
+    state, expected = env.state_dict(), env.render()
+    env.reset()
+    env.load_state_dict(state)
+    same(env.render(), expected)
+    env.close()
+
+
 # -- privileged ------------------------------------------------------------------------------------
 
 

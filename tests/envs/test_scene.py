@@ -1,14 +1,17 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from envs.grasp.camera import Views
-from envs.grasp.scene import BLOCK_CLEARANCE_M, SceneError, Scenes, SceneSampler, heading, to_world
+from envs.grasp.placement import BLOCK_CLEARANCE_M, _apart_on_support, rules
+from envs.grasp.scene import SceneError, Scenes, SceneSampler, heading, to_world
 from envs.grasp.settings import Camera, GraspSettings, Randomize, Support, Workspace
 
 COUNT = 500
 NO_LIMIT = np.pi
+WIDE = Support(x_m=(0.0, 9.0), y_m=(-9.0, 9.0))
 TWO_CAMERAS = {
     "depth": Camera(type="depth"),
     "above": Camera(
@@ -87,6 +90,32 @@ def test_footprints_keep_their_distance(scenes: Scenes) -> None:
     assert nearest < 3 * BLOCK_CLEARANCE_M
 
 
+def test_pairs_of_footprints_are_turned_down_exactly_where_they_overlap() -> None:
+    rng, rules_ = np.random.default_rng(0), rules(GraspSettings(support=WIDE))
+    decided, area_m2 = [], []
+    for _ in range(2000):
+        size = rng.uniform(0.05, 0.3, (2, 3))
+        position = np.zeros((2, 3))
+        position[1, :2] = rng.uniform(-0.25, 0.25, 2)
+        position[:, 0] += 3.0
+        yaw = rng.uniform(-np.pi, np.pi, 2)
+        decided.append(_apart_on_support(rules_, size, position, yaw))
+        grown = []  # by half the clearance on every side
+        for one, place, turn in zip(size, position, yaw, strict=True):
+            x, y = one[0] / 2, np.zeros(1)
+            center = place[:2] + [x * np.cos(turn), x * np.sin(turn)] + 0 * y
+            sides = (one[:2] + BLOCK_CLEARANCE_M).astype(float)
+            grown.append(
+                cv2.boxPoints((tuple(center.tolist()), tuple(sides.tolist()), np.degrees(turn)))
+            )
+        area_m2.append(cv2.intersectConvexConvex(*grown)[0])
+    decided, area_m2 = np.array(decided), np.array(area_m2)
+    assert 0.2 < decided.mean() < 0.8
+    clear = (area_m2 == 0.0) | (area_m2 > 1e-6)
+    assert clear.mean() > 0.99
+    np.testing.assert_array_equal(decided[clear], area_m2[clear] == 0.0)
+
+
 def test_target_is_nearest_by_its_lead(scenes: Scenes) -> None:
     distance = np.linalg.norm(scenes.block_position_m[..., :2], axis=-1)
     lead = distance[:, 1:].min(1) - distance[:, 0]
@@ -118,6 +147,19 @@ def test_support_is_a_setting() -> None:
     assert points[..., 0].max() <= 1.42
     assert points[..., 1].min() >= -0.3
     assert points[..., 1].max() <= 0.35
+
+
+def test_dimensions_of_an_l_use_their_whole_range() -> None:
+    scenes, _ = sample(GraspSettings(randomize=Randomize(shapes=("L",))), 300)
+    low, high = outline(scenes)
+    legs = 2 * scenes.box_half_m[:, :, 1, 1] / (high - low)[..., 1]
+    assert 0.4 <= legs.min() < 0.41
+    assert 0.59 < legs.max() <= 0.6
+    bars = 2 * scenes.box_half_m[:, :, 0, 2]
+    assert 0.08 <= bars.min() < 0.0805
+    assert 0.11 < bars.max() <= 0.12
+    on_left = scenes.box_center_m[:, :, 1, 1] > 0
+    assert 0.4 < on_left.mean() < 0.6
 
 
 def test_everything_drawn_lies_in_its_range(scenes: Scenes) -> None:
