@@ -211,6 +211,7 @@ class ScriptedEnvironment(Environment):
         space: gymnasium.spaces.Dict,
         observations: Mapping[str, Any],
         reward: Any,
+        *,
         terminated: Any = None,
         truncated: Any = None,
         final: Mapping[str, Any] | None = None,

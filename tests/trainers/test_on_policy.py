@@ -97,9 +97,7 @@ def test_truncated_episodes_go_on_in_value_and_terminated_ones_do_not(
     assert rollout.vectors["x"].flatten().tolist() == [1, 10, 2, 20, 3, 30]
 
 
-def test_an_end_that_is_both_counts_as_terminated(
-    scripted: Any, make_factory: MakeFactory
-) -> None:
+def test_an_end_that_is_both_counts_as_terminated(scripted: Any, make_factory: MakeFactory) -> None:
     env = scripted(
         PLAIN,
         {"x": columns([1, 2])},

@@ -186,7 +186,8 @@ def test_discrete_actions_start_nearly_uniform(make_factory: MakeFactory) -> Non
 
 
 @pytest.mark.parametrize(
-    "space", [Box(-1.0, 1.0, (2, 2), np.float32), Box(-1.0, 1.0, (), np.float32), MultiDiscrete([2])]
+    "space",
+    [Box(-1.0, 1.0, (2, 2), np.float32), Box(-1.0, 1.0, (), np.float32), MultiDiscrete([2])],
 )
 def test_other_action_spaces_are_the_users_mistake(
     make_factory: MakeFactory, space: gymnasium.Space[Any]
@@ -203,7 +204,7 @@ def test_unknown_observations_name_their_key_and_the_nearest(
     with pytest.raises(UserError) as caught:
         ActorCritic(make_factory(SPACE, CONV), settings)
     assert f"trainer.network_settings.{key}: " in str(caught.value)
-    assert "did you mean 'privileged'" in str(caught.value)
+    assert "no observation 'privilege'; did you mean 'privileged'?" in str(caught.value)
 
 
 def test_settings_that_contradict_each_other_are_refused() -> None:

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box
 from pydantic import ValidationError
 from torch import Tensor
-from torch.optim.optimizer import (
-    register_optimizer_step_post_hook,
-    register_optimizer_step_pre_hook,
-)
+from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from trainers.distributions import Categorical, DiagonalGaussian
-from trainers.interaction import NonFiniteError, concatenate
+from trainers.interaction import Interaction, NonFiniteError, concatenate
 from trainers.networks import NetworkFactory
 from trainers.ppo import (
     PPO,
@@ -28,7 +28,6 @@ from trainers.ppo import (
     clipped_value_loss,
     surrogate_loss,
 )
-from trainers.rollout import Rollout
 from trainers.session import Session
 
 MakePPO = Callable[..., PPO]
@@ -89,7 +88,9 @@ def test_the_measured_divergence_is_never_negative_and_near_the_true_one() -> No
     assert statistics["Policy/KL"].item() == pytest.approx(old.kl(new).mean().item(), rel=0.05)
     for few in range(50):
         part = slice(few, few + 2)
-        one = surrogate_loss(new[part], actions[part], old.log_prob(actions)[part], torch.ones(2), 1)
+        one = surrogate_loss(
+            new[part], actions[part], old.log_prob(actions)[part], torch.ones(2), 1
+        )
         assert one[1]["Policy/KL"].item() >= 0
 
 
@@ -345,11 +346,6 @@ def test_normalisation_learns_from_a_rollout_after_the_update(make_ppo: MakePPO)
 def test_a_batch_in_which_all_is_equal_changes_the_critic_alone(
     scripted: Any, make_factory: Callable[..., NetworkFactory]
 ) -> None:
-    import gymnasium
-    from gymnasium.spaces import Box
-
-    from trainers.interaction import Interaction
-
     space = gymnasium.spaces.Dict({"x": Box(-1.0, 1.0, (1,), np.float32)})
     ones = np.ones((9, 2, 1))
     env = scripted(
@@ -393,7 +389,9 @@ def test_a_loss_that_is_not_finite_stops_the_run_before_the_weights_change(
     env.step = huge  # type: ignore[method-assign]
     before = snapshot(iter(algorithm.policy.state_dict().values()))
     algorithm.collect()
-    with pytest.raises(NonFiniteError, match=r"step 16: the loss is (inf|nan), its gradient's norm"):
+    with pytest.raises(
+        NonFiniteError, match=r"step 16: the loss is (inf|nan), its gradient's norm"
+    ):
         algorithm.update(0.0)
     assert not changed(before, iter(algorithm.policy.state_dict().values()))
 
@@ -402,8 +400,6 @@ def test_going_back_to_a_state_repeats_everything(make_ppo: MakePPO) -> None:
     algorithm = make_ppo("target", CONSTANT)
     one_round(algorithm)
     weights = {name: t.clone() for name, t in algorithm.policy.state_dict().items()}
-    import copy
-
     state = copy.deepcopy(algorithm.state_dict())
     interaction = algorithm._interaction
     world = copy.deepcopy(interaction.state_dict())
@@ -427,7 +423,9 @@ def learned(algorithm: PPO, rounds: int) -> tuple[float, float]:
         algorithm.update(number / rounds)
         parts.append(algorithm._interaction.take_finished())
     first, last = parts[0], concatenate(parts[-2:])
-    return float((first.rewards / first.lengths).mean()), float((last.rewards / last.lengths).mean())
+    return float((first.rewards / first.lengths).mean()), float(
+        (last.rewards / last.lengths).mean()
+    )
 
 
 BIG = {"batch_size": 64, "buffer_size": 256, "num_epoch": 4, "gamma": 0.0, "beta": 0.0}

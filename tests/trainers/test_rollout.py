@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -107,7 +108,7 @@ def test_minibatches_are_a_partition_in_which_frames_stay_together(
     order = torch.cat(batches)
     assert sorted(order.tolist()) == list(range(len(owners)))
     visited = frame_index[order].tolist()
-    runs = 1 + sum(a != b for a, b in zip(visited, visited[1:], strict=False))
+    runs = 1 + sum(a != b for a, b in pairwise(visited))
     assert runs == len(shares)
 
 
