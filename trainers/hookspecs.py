@@ -59,5 +59,6 @@ def ventosa_environments() -> dict[str, type]:  # type: ignore[empty-body]
 def ventosa_trainers() -> dict[str, type]:  # type: ignore[empty-body]
     """Offer trainers (algorithms): name -> class; the run file's `trainer_type` names it.
 
-    It is built from a policy factory and its settings; `update(...)` returns statistics by name.
+    It follows `trainers.algorithm.Algorithm`, and its settings extend
+    `trainers.algorithm.TrainerSettings`.
     """

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
+from envs.grasp.blocks import MIN_BAR_M
+
 
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     low, high = value
@@ -65,6 +67,13 @@ class Workspace(BaseModel, frozen=True, extra="forbid"):
     z_m: Range = Field((0.60, 1.00), description="Tooltip z, up.")
     yaw_deg: Range = Field((-40.0, 40.0), description="Yaw of the tool about the vertical.")
 
+    @model_validator(mode="after")
+    def _is_not_flat(self) -> Workspace:
+        for name, (low, high) in self:
+            if low == high:
+                raise ValueError(f"{name} [{low}, {high}] has no width, so no action could vary it")
+        return self
+
 
 class Support(BaseModel, frozen=True, extra="forbid"):
     """The table's top, a box; what carries it is left out."""
@@ -98,6 +107,17 @@ class Randomize(BaseModel, frozen=True, extra="forbid"):
     light_azimuth_deg: Range = Field((-180.0, 180.0), description="RGB: where the light stands.")
     light_elevation_deg: Range = Field((30.0, 80.0), description="RGB: the light's elevation.")
     light_intensity: Range = Field((0.4, 0.9), description="RGB: diffuse share of the light.")
+
+    @model_validator(mode="after")
+    def _blocks_can_be_built(self) -> Randomize:
+        if self.block_size_m[0] <= MIN_BAR_M:
+            raise ValueError(
+                f"block_size_m starts at {self.block_size_m[0]} m: a face needs more than "
+                f"{MIN_BAR_M} m, the room for the cup"
+            )
+        if self.block_depth_m[0] <= 0.0:
+            raise ValueError(f"block_depth_m {list(self.block_depth_m)} must lie over 0")
+        return self
 
 
 class Goal(BaseModel, frozen=True, extra="forbid"):

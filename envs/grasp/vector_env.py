@@ -30,9 +30,9 @@ OVERVIEW = Camera(
     type="rgb",
     width=640,
     height=480,
-    fov_deg=55.0,
-    position_m=(1.9, -1.5, 1.7),
-    target_m=(0.75, 0.0, 0.75),
+    fov_deg=62.0,
+    position_m=(2.0, -1.6, 1.6),
+    target_m=(0.7, 0.0, 0.9),
     near_m=(0.1, 0.1),
     far_m=(10.0, 10.0),
 )

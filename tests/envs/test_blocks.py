@@ -27,29 +27,6 @@ MARGIN_PX = 4
 
 @dataclass(frozen=True)
 class Blocks:
-    """n blocks as `build_block` gives them."""
-
-    center_m: np.ndarray
-    half_m: np.ndarray
-    disc_m: np.ndarray
-    centroid_m: np.ndarray
-    size_m: np.ndarray
-
-
-def built(rows: list[tuple[int, tuple[float, float, float], float, float, bool]]) -> Blocks:
-    center, half = np.full((2, len(rows), 3, 3), np.nan)
-    points = np.array(
-        [
-            build_block(shape, np.array(size), bar, share, left, center[row], half[row])
-            for row, (shape, size, bar, share, left) in enumerate(rows)
-        ]
-    )
-    sizes = np.array([size for _, size, *_ in rows])
-    return Blocks(center, half, points[:, :2], points[:, 2:], sizes)
-
-
-@dataclass(frozen=True)
-class Blocks:
     """Built blocks: boxes (n, 3, 3), grasp points (n, 2) and size (n, 3)."""
 
     center_m: np.ndarray

@@ -291,19 +291,6 @@ def test_contacts_of_a_pose(
     assert (contacts.touched[0], contacts.collided[0]) == (touched, collided)
 
 
-@pytest.mark.parametrize("angle_deg", range(0, 90, 10))
-def test_the_cups_rim_is_round(
-    simulate: Callable[[Scenes], PyBulletSimulator], box_scene: SceneBuilder, angle_deg: int
-) -> None:
-    # The corner of a block points at the rim, from the side and from above.
-    scene = box_scene([((1.10, 0.0), 0.0, (0.1, 0.2, 0.2)), ASIDE])
-    simulator = simulate(scene)
-    away = np.array([np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))])
-    for radius, touched in ((0.02995, True), (0.03005, False)):
-        y, z = np.array([0.1, 0.8]) + radius * away
-        assert simulator.move(FIRST, pose(1.11, y, z)).touched[0] == touched
-
-
 def test_touching_and_colliding_at_once(
     simulate: Callable[[Scenes], PyBulletSimulator], box_scene: SceneBuilder
 ) -> None:

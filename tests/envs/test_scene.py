@@ -15,7 +15,7 @@ WIDE = Support(x_m=(0.0, 9.0), y_m=(-9.0, 9.0))
 TWO_CAMERAS = {
     "depth": Camera(type="depth"),
     "above": Camera(
-        type="rgb", width=60, height=50, fov_deg=36, position_m=(1.1, 0, 2.0), target_m=(1.15, 0, 0)
+        type="rgb", width=60, height=32, fov_deg=36, position_m=(1.1, 0, 2.0), target_m=(1.15, 0, 0)
     ),
 }
 
@@ -309,6 +309,23 @@ def test_number_of_blocks_is_a_setting(count: int) -> None:
 def test_impossible_ranges_are_an_error_that_names_the_way_out(settings: GraspSettings) -> None:
     with pytest.raises(SceneError, match=r"block_x_m.*target_lead_m.*fov_deg"):
         sample(settings, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("block_size_m", (0.05, 0.2)), ("block_depth_m", (0.0, 0.1))]
+)
+def test_blocks_that_cannot_be_built_are_an_error(name: str, value: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match=name):
+        Randomize(**{name: value})
+
+
+def test_the_smallest_blocks_hold_the_cup() -> None:
+    randomize = Randomize(block_size_m=(0.085, 0.09))
+    scenes, _ = sample(GraspSettings(randomize=randomize), 20)
+    used = (scenes.box_half_m > 0).all(-1)
+    assert not scenes.box_half_m[~used].any()
+    low, high = outline(scenes)
+    assert ((high - low)[..., 1:] >= 0.085 - 1e-9).all()
 
 
 def test_same_seed_same_scenes_other_seed_others() -> None:
