@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trainers.interaction import Interaction, Step
-from trainers.observations import Observations, to_tensors
+from trainers.observations import to_tensors
 from trainers.policy import ActorCritic, FrameFeatures, to_environment
 from trainers.returns import gae
 from trainers.rollout import FrameStore, Rollout, frame_spaces
@@ -49,76 +50,44 @@ class OnPolicyCollector:
         Raises:
             NonFiniteError: a reward or an observation is NaN or infinite.
         """
-        count = self._interaction.env.num_envs
-        everyone = np.arange(count)
-        images = frame_spaces(self._space)
-        frames = FrameStore(images, self._steps * count if images else 0)
-        frame_of = np.zeros(count, np.int64)
-        new_frames = everyone
-        features = FrameFeatures(None, None)
-        columns: dict[str, list[Tensor]] = {}
-        indices: list[NDArray[np.int64]] = []
-        steps: list[Step] = []
-        for _ in range(self._steps):
-            raw = self._interaction.observations
-            if images:
-                frame_of[new_frames] = frames.add(raw, new_frames)
-                with timed("encode"):
-                    features = self._encode(features, raw, new_frames)
-            else:
-                frame_of = everyone + len(indices) * count
-            with timed("act"):
-                observations = self._vectors(raw)
-                distribution, values = self._policy(observations, features)
-                actions = distribution.sample(self._generator)
-            step = self._interaction.step(to_environment(actions, self._action_space))
-            row = {
-                "actions": actions,
-                "log_probs": distribution.log_prob(actions),
-                "values": values,
-                "final_values": self._final_values(step, values),
-                **{f"vector {name}": vector for name, vector in observations.vectors.items()},
-            }
-            for name, value in row.items():
-                columns.setdefault(name, []).append(value)
-            indices.append(frame_of.copy())
-            steps.append(step)
-            new_frames = np.flatnonzero(~step.same_frame)
+        frames = _Frames(self._policy, self._interaction, self._steps, self._device)
+        moments = [self._play(frames) for _ in range(self._steps)]
         last = to_tensors(self._interaction.observations, self._space, self._device)
-        stacked = {name: torch.stack(values) for name, values in columns.items()}
-        advantages, returns = self._estimate(stacked, steps, self._policy.value(last), gamma, lambd)
-        flat = {name: tensor.flatten(0, 1) for name, tensor in stacked.items()}
+        advantages, returns = self._estimate(moments, self._policy.value(last), gamma, lambd)
         return Rollout(
-            frames=frames.tensors(self._device),
-            frame_index=torch.from_numpy(np.concatenate(indices)).to(self._device),
+            frames=frames.tensors(),
+            frame_index=torch.cat([moment.frame_index for moment in moments]),
             vectors={
-                name.removeprefix("vector "): tensor
-                for name, tensor in flat.items()
-                if name.startswith("vector ")
+                name: torch.cat([moment.vectors[name] for moment in moments])
+                for name in moments[0].vectors
             },
-            actions=flat["actions"],
-            log_probs=flat["log_probs"],
-            values=flat["values"],
+            actions=torch.cat([moment.actions for moment in moments]),
+            log_probs=torch.cat([moment.log_probs for moment in moments]),
+            values=torch.cat([moment.values for moment in moments]),
             advantages=advantages.flatten(),
             returns=returns.flatten(),
         )
 
-    def _encode(
-        self, features: FrameFeatures, raw: Mapping[str, NDArray[Any]], rows: NDArray[np.int64]
-    ) -> FrameFeatures:
-        """The features of everyone's frames, given those from before and whose are new."""
-        if not len(rows):
-            return features
-        fresh = self._policy.encode_frames(to_tensors(raw, self._space, self._device, rows))
-        if len(rows) == len(next(iter(raw.values()))):
-            return fresh
-        return features.with_rows(torch.from_numpy(rows).to(self._device), fresh)
-
-    def _vectors(self, raw: Mapping[str, NDArray[Any]]) -> Observations:
-        """The observations without their frames, whose features are known."""
-        images = frame_spaces(self._space)
-        vectors = {name: values for name, values in raw.items() if name not in images}
-        return to_tensors(vectors, self._space, self._device)
+    def _play(self, frames: _Frames) -> _Moment:
+        """Acts once in every environment."""
+        raw = self._interaction.observations
+        frame_index, features = frames.look(raw)
+        with timed("act"):
+            vectors = {name: values for name, values in raw.items() if name not in frames.names}
+            observations = to_tensors(vectors, self._space, self._device)
+            distribution, values = self._policy(observations, features)
+            actions = distribution.sample(self._generator)
+        step = self._interaction.step(to_environment(actions, self._action_space))
+        frames.new = np.flatnonzero(~step.same_frame)
+        return _Moment(
+            frame_index=frame_index,
+            vectors=observations.vectors,
+            actions=actions,
+            log_probs=distribution.log_prob(actions),
+            values=values,
+            final_values=self._final_values(step, values),
+            step=step,
+        )
 
     def _final_values(self, step: Step, like: Tensor) -> Tensor:
         """Values (N,) of the last observations of episodes that were cut off; else zero."""
@@ -130,26 +99,84 @@ class OnPolicyCollector:
         return values
 
     def _estimate(
-        self,
-        columns: dict[str, Tensor],
-        steps: list[Step],
-        last_values: Tensor,
-        gamma: float,
-        lambd: float,
+        self, moments: list[_Moment], last_values: Tensor, gamma: float, lambd: float
     ) -> tuple[Tensor, Tensor]:
+        """Advantages and returns (T, N)."""
+
         def stack(name: str, dtype: torch.dtype) -> Tensor:
-            array = np.stack([getattr(step, name) for step in steps])
+            array = np.stack([getattr(moment.step, name) for moment in moments])
             return torch.from_numpy(array).to(self._device, dtype)
 
         terminated, truncated = stack("terminated", torch.bool), stack("truncated", torch.bool)
-        values = columns["values"]
+        values = torch.stack([moment.values for moment in moments])
+        final_values = torch.stack([moment.final_values for moment in moments])
         following = torch.cat([values[1:], last_values[None]])
         return gae(
             stack("reward", values.dtype),
             values,
-            torch.where(truncated, columns["final_values"], following),
+            torch.where(truncated, final_values, following),
             terminated,
             terminated | truncated,
             gamma=gamma,
             lambd=lambd,
         )
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """One step of N environments: tensors of leading length N, and what the environments said."""
+
+    frame_index: Tensor
+    vectors: dict[str, Tensor]
+    actions: Tensor
+    log_probs: Tensor
+    values: Tensor
+    final_values: Tensor
+    step: Step
+
+
+class _Frames:
+    """The frames of one collection, and the features of those in view.
+
+    Attributes:
+        names: the observations that are frames.
+        new: the environments whose frame has not been looked at yet.
+    """
+
+    def __init__(
+        self, policy: ActorCritic, interaction: Interaction, steps: int, device: torch.device
+    ):
+        self._policy, self._device = policy, device
+        self._space = interaction.env.single_observation_space
+        self._count = interaction.env.num_envs
+        spaces = frame_spaces(self._space)
+        self.names = frozenset(spaces)
+        self._store = FrameStore(spaces, steps * self._count)
+        self._index = np.zeros(self._count, np.int64)
+        self._features = FrameFeatures(None, None)
+        self.new = np.arange(self._count)
+
+    def look(self, raw: Mapping[str, NDArray[Any]]) -> tuple[Tensor, FrameFeatures]:
+        """Keeps and encodes the new frames; returns everyone's index (N,) and features.
+
+        Without cameras every observation counts as a frame of its own.
+        """
+        if not self.names:
+            self.new = np.arange(self._count)
+        if len(self.new):
+            self._index[self.new] = self._store.add(raw, self.new)
+            with timed("encode"):
+                self._encode(raw)
+        return torch.from_numpy(self._index.copy()).to(self._device), self._features
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All frames by name, (U, H, W, C)."""
+        return self._store.tensors(self._device)
+
+    def _encode(self, raw: Mapping[str, NDArray[Any]]) -> None:
+        frames = {name: raw[name] for name in self.names}
+        fresh = self._policy.encode_frames(to_tensors(frames, self._space, self._device, self.new))
+        if len(self.new) < self._count:
+            rows = torch.from_numpy(self.new).to(self._device)
+            fresh = self._features.with_rows(rows, fresh)
+        self._features = fresh
