@@ -36,6 +36,8 @@ class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     - `measures`: by name, what to report of an episode (N,), read where it ends. `success` among
       them is the success rate.
 
+    Arrays that were handed out, observations above all, are not written to afterwards.
+
     Built as `cls(settings, rewards, seed)`.
 
     Attributes:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from encoders.spaces import DepthImage
 
 MIN_SIDE_PX = 240
+BYTE_MAX = 255.0
 
 
 def picture(space: gymnasium.Space[Any], frame: NDArray[Any]) -> NDArray[np.uint8]:
@@ -24,6 +25,8 @@ def picture(space: gymnasium.Space[Any], frame: NDArray[Any]) -> NDArray[np.uint
         rgb = cv2.cvtColor(cv2.applyColorMap(gray, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
     else:
         rgb = frame[..., :3] if frame.shape[-1] >= 3 else np.repeat(frame[..., :1], 3, axis=-1)
+        if np.issubdtype(rgb.dtype, np.floating):
+            rgb = np.rint(rgb.clip(0.0, 1.0) * BYTE_MAX)
         rgb = rgb.astype(np.uint8)
     factor = max(1, -(-MIN_SIDE_PX // min(rgb.shape[:2])))
     enlarged = cv2.resize(rgb, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)

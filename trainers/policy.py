@@ -19,6 +19,7 @@ from trainers.observations import Observations
 
 ACTOR_GAIN = 0.01  # a small last layer: at first every observation gets nearly the same action
 CRITIC_GAIN = 1.0
+TINY_STD = 1e-6
 NETWORK_PATH = "trainer.network_settings"
 
 
@@ -79,8 +80,8 @@ class ActorCritic(nn.Module):
         match factory.action_space:
             case gymnasium.spaces.Box(shape=(size,)):
                 self.action_head = head(width, size, ACTOR_GAIN)
-                initial = math.log(settings.initial_std)
-                self.log_std = nn.Parameter(torch.full((size,), initial))
+                above = math.log(max(settings.initial_std - settings.min_std, TINY_STD))
+                self.log_std = nn.Parameter(torch.full((size,), above))
             case gymnasium.spaces.Discrete(n=count):
                 self.action_head = head(width, int(count), ACTOR_GAIN)
             case other:
@@ -137,7 +138,9 @@ class ActorCritic(nn.Module):
         outputs = self.action_head(hidden)
         if self.log_std is None:
             return Categorical(outputs)
-        return DiagonalGaussian(outputs, self.log_std.clamp(min=self._min_log_std))
+        # std = min_std + exp(log_std): a floor that, unlike a clamp, always lets gradients through.
+        floor = torch.tensor(self._min_log_std, device=outputs.device)
+        return DiagonalGaussian(outputs, torch.logaddexp(self.log_std, floor))
 
     def _value(
         self, observations: Observations, hidden: Tensor | None, known: FrameFeatures

@@ -161,15 +161,10 @@ def build_environment(run: RunSettings, seed: int) -> Environment:
         UserError: the settings don't fit together.
     """
     terms = [
-        RewardTerm(
-            reward.component.name, reward.weight, reward.component.cls(reward.component.settings)
-        )
+        RewardTerm(reward.component.name, reward.weight, _build(reward.component, "rewards"))
         for reward in run.rewards
     ]
-    try:
-        env: Environment = run.environment.cls(run.environment.settings, terms, seed)
-    except ValueError as error:
-        raise UserError(f"environment ({run.environment.name}): {error}") from error
+    env: Environment = _build(run.environment, "environment", terms, seed)
     return env
 
 
@@ -177,8 +172,16 @@ def build_curriculum(run: RunSettings) -> Curriculum | None:
     """The run's curriculum, if it has one."""
     if run.curriculum is None:
         return None
-    curriculum: Curriculum = run.curriculum.cls(run.curriculum.settings)
+    curriculum: Curriculum = _build(run.curriculum, "curriculum")
     return curriculum
+
+
+def _build(component: Component, path: str, *rest: Any) -> Any:
+    """Builds a component; what it does not like about its settings is the user's mistake."""
+    try:
+        return component.cls(component.settings, *rest)
+    except ValueError as error:
+        raise UserError(f"{path} ({component.name}): {error}") from error
 
 
 def build_factory(run: RunSettings, registries: Registries, env: Environment) -> NetworkFactory:

@@ -45,12 +45,11 @@ def train(
             if isinstance(stop, StopRequested):
                 return False
             raise
-        share = min(interaction.step_count / max_steps, 1.0)
         with timed("update"):
-            summary.add(algorithm.update(share))
+            summary.add(algorithm.update(step / max_steps))
         episodes = interaction.take_finished()
         summary.add_episodes(episodes)
-        if session.advance_curriculum(episodes, share):
+        if session.advance_curriculum(episodes, interaction.step_count / max_steps):
             progress.message(
                 f"step {interaction.step_count}: lesson {session.lesson + 1} of "
                 f"{session.lesson_count} begins"

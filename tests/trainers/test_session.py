@@ -1,0 +1,192 @@
+"""A run's parts wired together, and what is said where they do not fit."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from curricula.samplers import UniformSampler
+from trainers.errors import UserError
+from trainers.interaction import Episodes
+from trainers.plugins import Registries
+from trainers.session import Session, resolve_device
+from trainers.settings import RunSettings
+
+MakeRun = Callable[..., RunSettings]
+MakeSession = Callable[..., Session]
+LESSONS = {
+    "type": "lessons",
+    "measure": "reward",
+    "smoothing_episodes": 2,
+    "min_lesson_length": 2,
+    "lessons": [
+        {"threshold": 0.0, "parameters": {"scale": 3.0}},
+        {"threshold": 0.5, "parameters": {"scale": 2.0}},
+        {"parameters": {"scale": 1.0}},
+    ],
+}
+
+
+def refused(make_run: MakeRun, registries: Registries, *arguments: Any, **sections: Any) -> str:
+    with pytest.raises(UserError) as caught:
+        Session(make_run(*arguments, **sections), registries)
+    return str(caught.value)
+
+
+def test_an_encoder_for_no_observation_names_the_nearest(
+    make_run: MakeRun, registries: Registries
+) -> None:
+    encoders = {"goals": {"type": "vector"}}
+    message = refused(make_run, registries, "target", encoders=encoders)
+    assert message == "encoders: the environment has no observation 'goals'; did you mean 'goal'?"
+
+
+def test_an_image_too_small_for_its_encoder_names_the_encoders_key(
+    make_run: MakeRun, registries: Registries
+) -> None:
+    encoders = {"camera": {"type": "paper", "size": 80}}
+    message = refused(make_run, registries, "picture", encoders=encoders)
+    assert message.startswith("encoders.camera (paper): a 8x8 image")
+    # The default encoder has the same rule, and the same words.
+    assert refused(make_run, registries, "picture").startswith("encoders.camera (simple): a 8x8")
+
+
+def test_an_encoder_of_the_wrong_kind_names_its_key(
+    make_run: MakeRun, registries: Registries
+) -> None:
+    message = refused(make_run, registries, "target", encoders={"goal": {"type": "simple"}})
+    assert message.startswith("encoders.goal (simple): ")
+
+
+def test_unknown_environment_parameters_name_where_they_stand(
+    make_run: MakeRun, registries: Registries
+) -> None:
+    message = refused(make_run, registries, "target", environment_parameters={"scales": 1.0})
+    assert message == (
+        "environment_parameters: the environment has no parameter 'scales'; did you mean 'scale'?"
+    )
+    lessons = copy.deepcopy(LESSONS)
+    for lesson in lessons["lessons"]:  # type: ignore[union-attr]
+        lesson["parameters"] = {"size": 1.0}  # type: ignore[index]
+    message = refused(make_run, registries, "target", curriculum=lessons)
+    assert message == ("curriculum: the environment has no parameter 'size'; known: scale, shift")
+
+
+@pytest.mark.parametrize(
+    "device", ["cuda:77", "gpu", "cuda" if not torch.cuda.is_available() else "x"]
+)
+def test_a_device_that_is_not_there_is_the_users_mistake(device: str) -> None:
+    with pytest.raises(UserError, match=f"^device: '{device}' can't be used: .*; use 'cpu'$"):
+        resolve_device(device)
+
+
+def test_the_cpu_is_a_device() -> None:
+    assert resolve_device("cpu") == torch.device("cpu")
+
+
+def test_the_environment_is_closed_when_the_rest_does_not_fit(
+    make_run: MakeRun, registries: Registries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run("target", encoders={"goals": {"type": "vector"}})
+    closed: list[Any] = []
+    monkeypatch.setattr(run.environment.cls, "close_extras", lambda self, **_: closed.append(self))
+    with pytest.raises(UserError):
+        Session(run, registries)
+    assert len(closed) == 1
+    session = Session(make_run("target"), registries)
+    session.close()
+    assert closed[1:] == [session.interaction.env]
+
+
+def test_settings_the_environment_refuses_name_its_section(
+    make_run: MakeRun, registries: Registries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run("target")
+
+    def refuse(*_: Any) -> None:
+        raise ValueError("too many blocks for this table: lower blocks")
+
+    monkeypatch.setattr(run.environment.cls, "__init__", refuse)
+    with pytest.raises(UserError, match=r"^environment \(target\): too many blocks"):
+        Session(run, registries)
+
+
+def parameters(session: Session) -> dict[str, Any]:
+    return dict(session.interaction.env.parameters)  # type: ignore[attr-defined]
+
+
+def test_a_lessons_parameters_stand_over_the_runs(make_session: MakeSession) -> None:
+    sampler = {"sampler_type": "uniform", "sampler_parameters": {"min_value": 0, "max_value": 1}}
+    session = make_session(
+        "target", environment_parameters={"scale": 9.0, "shift": sampler}, curriculum=LESSONS
+    )
+    assert parameters(session)["scale"] == 3.0
+    assert isinstance(parameters(session)["shift"], UniformSampler)
+    session = make_session("target", environment_parameters={"scale": 9.0})
+    assert parameters(session) == {"scale": 9.0}
+    assert (session.lesson, session.lesson_count) == (0, 1)
+
+
+def episodes(*rewards: float) -> Episodes:
+    return Episodes(np.array(rewards), np.ones(len(rewards)), {}, {})
+
+
+def test_lessons_advance_with_the_episodes_and_set_the_environment(
+    make_session: MakeSession,
+) -> None:
+    session = make_session("target", curriculum=LESSONS)
+    assert session.lesson_count == 3
+    assert not session.advance_curriculum(episodes(1.0), 0.1)
+    assert parameters(session) == {"scale": 3.0}
+    assert session.advance_curriculum(episodes(1.0), 0.2)
+    assert session.lesson == 1
+    assert parameters(session) == {"scale": 2.0}
+    assert not session.advance_curriculum(episodes(0.1, 0.1, 0.1), 0.3)
+    assert not make_session("target").advance_curriculum(episodes(9.0, 9.0), 1.0)
+
+
+def test_lessons_of_progress_see_the_runs(make_session: MakeSession) -> None:
+    lessons = {**LESSONS, "measure": "progress", "lessons": copy.deepcopy(LESSONS["lessons"])}
+    del lessons["smoothing_episodes"], lessons["min_lesson_length"]
+    lessons["lessons"][0]["threshold"] = 0.25  # type: ignore[index]
+    session = make_session("target", curriculum=lessons)
+    assert not session.advance_curriculum(episodes(), 0.25)
+    assert session.advance_curriculum(episodes(), 0.26)
+
+
+def test_a_state_taken_up_goes_on_in_its_lesson(make_session: MakeSession) -> None:
+    session = make_session("target", curriculum=LESSONS)
+    session.advance_curriculum(episodes(1.0, 1.0), 0.1)
+    session.advance_curriculum(episodes(0.9), 0.1)
+    state, weights = copy.deepcopy(session.state_dict()), session.weights()
+    other = make_session("target", curriculum=LESSONS, seed=5)
+    other.load_state_dict(weights, state)
+    assert other.lesson == 1
+    assert parameters(other) == {"scale": 2.0}
+    assert other.advance_curriculum(episodes(0.9), 0.1)  # the second good one of this lesson
+    np.testing.assert_equal(
+        other.interaction.observations["goal"], session.interaction.observations["goal"]
+    )
+
+
+def test_a_state_of_a_longer_curriculum_is_refused(make_session: MakeSession) -> None:
+    session = make_session("target", curriculum=LESSONS)
+    state = copy.deepcopy(session.state_dict())
+    state["curriculum"]["lesson"] = 7
+    with pytest.raises(ValueError, match=r"7.*3 lessons"):
+        session.load_state_dict(session.weights(), state)
+
+
+def test_equal_seeds_begin_alike_and_others_do_not(make_session: MakeSession) -> None:
+    first, again, other = (make_session("target", seed=seed) for seed in (1, 1, 2))
+    for name, tensor in first.weights().items():
+        assert torch.equal(tensor, again.weights()[name])
+    goal = first.interaction.observations["goal"]
+    np.testing.assert_array_equal(goal, again.interaction.observations["goal"])
+    assert not np.array_equal(goal, other.interaction.observations["goal"])
+    assert any(not torch.equal(t, other.weights()[name]) for name, t in first.weights().items())

@@ -1,0 +1,241 @@
+"""The training loop: when it saves, and what it leaves behind however it ends."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from envs.environment import EnvironmentFailure
+from trainers.checkpoint import Checkpoints, Loaded
+from trainers.interaction import NonFiniteError
+from trainers.plugins import Registries
+from trainers.session import Session
+from trainers.settings import RunSettings
+from trainers.summary import Summary
+from trainers.training import train
+
+MakeRun = Callable[..., RunSettings]
+LESSONS = {
+    "type": "lessons",
+    "measure": "reward",
+    "smoothing_episodes": 2,
+    "min_lesson_length": 9,
+    "lessons": [{"threshold": -99.0, "parameters": {"scale": 2.0}}, {"parameters": {"scale": 1.0}}],
+}
+
+
+class Quiet:
+    """A log and a display that keep only the messages."""
+
+    def __init__(self) -> None:
+        self.messages: list[str] = []
+
+    def message(self, text: str) -> None:
+        self.messages.append(text)
+
+    def ignore(self, *_: Any) -> None:
+        pass
+
+    update = scalars = images = status = ignore
+
+
+class Training:
+    """One training run in a temporary folder."""
+
+    def __init__(
+        self,
+        run: RunSettings,
+        registries: Registries,
+        folder: Path,
+        stop_at_step: float = np.inf,
+    ):
+        self.session = Session(run, registries, lambda: self.steps >= stop_at_step)
+        self.settings: Any = run.trainer.settings
+        self.checkpoints = Checkpoints(folder, keep=99)
+        self.quiet = Quiet()
+        self.session.reset()
+
+    @property
+    def steps(self) -> int:
+        return self.session.interaction.step_count
+
+    @property
+    def saved(self) -> list[int]:
+        return [entry.step for entry in self.checkpoints.list_checkpoints()]
+
+    def resume(self) -> Loaded:
+        loaded = self.checkpoints.load_latest()
+        self.session.load_state_dict(loaded.weights, loaded.state)
+        return loaded
+
+    def train(self) -> bool:
+        quiet: Any = self.quiet
+        summary = Summary(quiet, "run", self.settings.max_steps, self.settings.summary_freq)
+        return train(self.session, self.settings, summary, self.checkpoints, quiet)
+
+
+@pytest.fixture
+def training(make_run: MakeRun, registries: Registries, tmp_path: Path) -> Callable[..., Training]:
+    """Builds a `Training` of 16 steps a collection; arguments as `write_run`'s."""
+
+    def make(
+        trainer: Any = None, *, stop_at_step: float = np.inf, folder: str = "run", **rest: Any
+    ) -> Training:
+        run = make_run("target", trainer or {}, **rest)
+        return Training(run, registries, tmp_path / folder, stop_at_step)
+
+    return make
+
+
+def test_a_run_ends_after_its_steps_and_is_saved_on_the_way(
+    training: Callable[..., Training],
+) -> None:
+    one = training({"max_steps": 72, "checkpoint_interval": 32})
+    assert one.train() is True
+    assert one.steps == 80  # the fifth collection reaches 72
+    assert one.saved == [32, 64, 80]
+    last = one.checkpoints.load_latest()
+    assert last.state["step"] == 80
+    for name, tensor in one.session.weights().items():
+        assert torch.equal(tensor, last.weights[name])
+
+
+def test_the_algorithm_hears_how_much_of_the_run_is_over(
+    training: Callable[..., Training], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = training({"max_steps": 40})
+    shares: list[float] = []
+    update = one.session.algorithm.update
+    monkeypatch.setattr(
+        one.session.algorithm, "update", lambda share: shares.append(share) or update(share)
+    )
+    one.train()
+    assert shares == [0.0, 0.4, 0.8]
+
+
+def test_a_stop_within_a_collection_saves_the_state_before_it(
+    training: Callable[..., Training],
+) -> None:
+    one = training(stop_at_step=40)
+    assert one.train() is False
+    assert one.steps == 40
+    assert one.saved == [32]
+    assert one.checkpoints.load_latest().state["interaction"]["step_count"] == 32
+
+
+def test_a_stop_before_the_first_step_can_be_taken_up_too(
+    training: Callable[..., Training],
+) -> None:
+    assert training(stop_at_step=0).train() is False
+    again = training()
+    assert again.resume().step == 0
+    assert again.train() is True
+    assert again.saved[-1] == 64
+
+
+@pytest.mark.parametrize("ended_by", ["limit", "stop"])
+@pytest.mark.parametrize("critic", ["shared", "separate"])
+def test_two_halves_make_the_same_whole(
+    training: Callable[..., Training], ended_by: str, critic: str
+) -> None:
+    def trainer(max_steps: int) -> dict[str, Any]:
+        hyper = {"learning_rate_schedule": "constant", "beta_schedule": "constant", "num_epoch": 2}
+        network = {"critic": critic, "normalize": True}
+        return {"max_steps": max_steps, "hyperparameters": hyper, "network_settings": network}
+
+    whole = training(trainer(96), folder="whole", curriculum=LESSONS)
+    assert whole.train()
+    first = (
+        training(trainer(48), folder="halves", curriculum=LESSONS)
+        if ended_by == "limit"
+        else training(trainer(96), folder="halves", curriculum=LESSONS, stop_at_step=52)
+    )
+    first.train()
+    assert first.saved[-1] == 48
+    second = training(trainer(96), folder="halves", curriculum=LESSONS)
+    second.resume()
+    assert second.train()
+    expected, got = whole.checkpoints.load_latest(), second.checkpoints.load_latest()
+    assert expected.step == got.step == 96
+    assert expected.state["curriculum"]["lesson"] == 1
+    for name, tensor in expected.weights.items():
+        assert torch.equal(tensor, got.weights[name]), name
+    np.testing.assert_equal(as_arrays(got.state), as_arrays(expected.state))
+
+
+def as_arrays(state: Any) -> Any:
+    if isinstance(state, torch.Tensor):
+        return state.numpy()
+    if isinstance(state, dict):
+        return {key: as_arrays(value) for key, value in state.items()}
+    return [as_arrays(value) for value in state] if isinstance(state, list) else state
+
+
+def breaking_after(one: Training, steps: int, breakage: Callable[[Any], Any]) -> None:
+    step = one.session.interaction.env.step
+
+    def broken(actions: np.ndarray) -> Any:
+        result = step(actions)
+        return breakage(result) if one.steps >= steps else result
+
+    one.session.interaction.env.step = broken  # type: ignore[method-assign]
+
+
+def test_a_broken_environment_leaves_the_run_saved(training: Callable[..., Training]) -> None:
+    one = training({"checkpoint_interval": 1000})
+
+    def breakage(_: Any) -> Any:
+        raise EnvironmentFailure("a cable came loose")
+
+    breaking_after(one, 40, breakage)
+    with pytest.raises(EnvironmentFailure, match="a cable came loose"):
+        one.train()
+    assert one.saved == [32]
+
+
+@pytest.mark.parametrize("bad", [np.nan, 1e30])
+def test_numbers_that_are_not_finite_save_nothing_new(
+    training: Callable[..., Training], bad: float
+) -> None:
+    one = training({"checkpoint_interval": 16})
+
+    def breakage(result: Any) -> Any:
+        observations, reward, *rest = result
+        return observations, reward + bad, *rest
+
+    breaking_after(one, 36, breakage)
+    good: dict[int, dict[str, torch.Tensor]] = {}
+    save = one.checkpoints.save
+
+    def noted(step: int, weights: Any, *rest: Any) -> Path:
+        good[step] = copy.deepcopy(dict(weights))
+        return save(step, weights, *rest)
+
+    one.checkpoints.save = noted  # type: ignore[method-assign]
+    with pytest.raises(NonFiniteError, match=r"^step (40|48): the (reward|loss)"):
+        one.train()
+    assert one.saved == [16, 32]
+    last = one.checkpoints.load_latest()
+    assert all(torch.equal(last.weights[name], tensor) for name, tensor in good[32].items())
+
+
+def test_a_new_lesson_is_announced(training: Callable[..., Training]) -> None:
+    one = training(curriculum=LESSONS)  # 4 episodes a collection: the ninth is in the third
+    one.train()
+    assert one.quiet.messages == ["step 48: lesson 2 of 2 begins"]
+
+
+def test_a_finished_run_taken_up_again_is_finished_at_once(
+    training: Callable[..., Training],
+) -> None:
+    training().train()
+    again = training()
+    again.resume()
+    assert again.train() is True
+    assert again.steps == 64
