@@ -262,13 +262,16 @@ def _seen(
                     corner,
                 )
                 for camera in range(len(camera_m)):
-                    local = (corner - camera_m[camera]) @ camera_rotation[camera]
+                    # Not a matrix product: numba would want SciPy for it.
+                    ray, axes = corner - camera_m[camera], camera_rotation[camera]
+                    x, y = (ray * axes[:, 0]).sum(), (ray * axes[:, 1]).sum()
+                    depth = (ray * axes[:, 2]).sum()
                     width, rows = rules.image_px[camera]
                     focal = rules.focal_px[camera]
                     if (
-                        local[2] <= 0.0
-                        or abs(local[0]) * focal > local[2] * width / 2
-                        or abs(local[1]) * focal > local[2] * rows / 2
+                        depth <= 0.0
+                        or abs(x) * focal > depth * width / 2
+                        or abs(y) * focal > depth * rows / 2
                     ):
                         return False
     return True
