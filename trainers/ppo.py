@@ -96,6 +96,7 @@ class PPO:
             ],
             lr=hyper.learning_rate,
             eps=1e-5,
+            fused=True,
         )
         steps = -(-hyper.buffer_size // interaction.env.num_envs)
         self._collector = OnPolicyCollector(self.policy, interaction, steps, generator, device)
