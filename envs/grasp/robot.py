@@ -55,6 +55,8 @@ class Robot:
         link_joints: For each link the index of the joint that moves it; -1 where it is fixed.
         link_origins: (L, 4, 4) each link's frame in its parent's frame with all joints at zero.
         link_primitives: For each link its collision shapes, which are its visual shapes too.
+        link_colors: (L, 3) red, green and blue in [0, 1] of each link's first visual shape; white
+            where it has none.
     """
 
     path: Path
@@ -68,6 +70,7 @@ class Robot:
     link_joints: tuple[int, ...]
     link_origins: np.ndarray
     link_primitives: tuple[tuple[Primitive, ...], ...]
+    link_colors: np.ndarray
 
     @property
     def tooltip_link(self) -> int:
@@ -131,6 +134,7 @@ def load_robot(path: str | Path = KR16_URDF) -> Robot:
             [_origin(joints[name], str(path)) if name in joints else np.eye(4) for name in order]
         ),
         link_primitives=tuple(_primitives(links[name], path) for name in order),
+        link_colors=np.array([_color(links[name], root, path) for name in order]),
     )
 
 
@@ -188,6 +192,19 @@ def _axis(joint: ET.Element, path: Path) -> np.ndarray:
 def _primitives(link: ET.Element, path: Path) -> tuple[Primitive, ...]:
     where = f"{path}: link '{link.get('name')}'"
     return tuple(_primitive(collision, where) for collision in link.findall("collision"))
+
+
+def _color(link: ET.Element, root: ET.Element, path: Path) -> np.ndarray:
+    """(3,) the color of a link's first visual shape, by the name of a material of the robot."""
+    where = f"{path}: link '{link.get('name')}'"
+    material = link.find("visual/material")
+    if material is None:
+        return np.ones(3)
+    name = _attribute(material, "name", where)
+    color = root.find(f"material[@name='{name}']/color")
+    if color is None:
+        raise ValueError(f"{where}: the robot has no <material name='{name}'> with a <color>")
+    return _numbers(_attribute(color, "rgba", where), 4, where)[:3]
 
 
 def _primitive(collision: ET.Element, where: str) -> Primitive:

@@ -141,10 +141,17 @@ class Goal(BaseModel, frozen=True, extra="forbid"):
 class GraspSettings(BaseModel, frozen=True, extra="forbid"):
     """The grasp task: a KUKA KR 16 brings its suction cup in front of the nearest block."""
 
-    simulator: Literal["pybullet"] = Field("pybullet", description="The engine underneath.")
+    simulator: Literal["pybullet", "fast"] = Field(
+        "pybullet",
+        description="The engine underneath: PyBullet, or compiled loops over all worlds.",
+    )
     num_envs: int = Field(64, ge=1, le=65536, description="Environments stepped together.")
     workers: int | None = Field(
-        None, ge=0, le=1024, description="Worker processes; 0: in this one; null: one per core."
+        None,
+        ge=0,
+        le=1024,
+        description="PyBullet's worker processes, or threads of `simulator: fast`; 0: none beside "
+        "this one; null: one per core.",
     )
     episode_steps: int = Field(10, ge=1, description="Actions before an episode is truncated.")
     frame_grab: bool = Field(

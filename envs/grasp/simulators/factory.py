@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 
+import numba
+
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.base import Simulator
+from envs.grasp.simulators.fast import FastSimulator
 from envs.grasp.simulators.pybullet import PyBulletSimulator
 from envs.grasp.simulators.workers import ParallelSimulator
 
@@ -14,7 +17,13 @@ MIN_WORLDS_PER_WORKER = 4
 
 
 def make_simulator(settings: GraspSettings, num_worlds: int, window: bool = False) -> Simulator:
-    """Builds the simulator of a run; a window means no worker processes."""
+    """Builds the simulator of a run; a window means no worker processes.
+
+    Raises:
+        ValueError: a window is asked for where there is none.
+    """
+    if settings.simulator == "fast":
+        return _fast(settings, num_worlds, window)
     workers = settings.workers
     if workers is None:
         workers = min(len(os.sched_getaffinity(0)), num_worlds // MIN_WORLDS_PER_WORKER)
@@ -22,3 +31,14 @@ def make_simulator(settings: GraspSettings, num_worlds: int, window: bool = Fals
     if window or workers == 0:
         return PyBulletSimulator(num_worlds, settings.support, window)
     return ParallelSimulator(num_worlds, min(workers, num_worlds), settings.support)
+
+
+def _fast(settings: GraspSettings, num_worlds: int, window: bool) -> FastSimulator:
+    if window:
+        raise ValueError(
+            "simulator: fast has no window: use simulator: pybullet, or render_mode: rgb_array"
+        )
+    threads = settings.workers
+    if threads is not None:
+        threads = min(max(threads, 1), numba.get_num_threads())
+    return FastSimulator(num_worlds, settings.support, threads)

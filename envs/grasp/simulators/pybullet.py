@@ -19,6 +19,7 @@ from envs.grasp.robot import KR16_URDF
 from envs.grasp.scene import Scenes
 from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
+from envs.grasp.simulators.colors import BLOCK_RGBA, SUPPORT_RGBA
 
 # A client costs 30 MB whatever it holds, so worlds share them; but every block that is parked while
 # another world has its turn costs some microseconds of each picture.
@@ -28,9 +29,6 @@ LOADS_BEFORE_RESET = 400
 PARKED_M = [0.0, 0.0, -1000.0]
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 WINDOW_POSE_S = 0.04
-
-SUPPORT_RGBA = (0.55, 0.55, 0.58, 1.0)
-BLOCK_RGBA = ((0.86, 0.24, 0.20, 1.0), (0.20, 0.50, 0.85, 1.0), (0.95, 0.75, 0.20, 1.0))
 
 
 class PyBulletSimulator:

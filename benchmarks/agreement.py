@@ -1,0 +1,298 @@
+"""Whether the fast simulator shows and feels what PyBullet does: `python -m benchmarks.agreement`.
+
+Random scenes, the robot at random poses of its workspace, one picture of each by both simulators;
+then random motions, and what they touch. Where the contacts differ, PyBullet is asked again with
+all boxes a millimetre larger or smaller, which tells whether the shapes were about to touch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from envs.grasp.camera import Views
+from envs.grasp.scene import Scenes, SceneSampler
+from envs.grasp.settings import Camera, GraspSettings, Support
+from envs.grasp.simulators.base import Contacts, Simulator
+from envs.grasp.simulators.fast import FastSimulator
+from envs.grasp.simulators.pybullet import PyBulletSimulator
+from envs.grasp.task import Arm
+
+DEPTH_TOLERANCE_M = 0.001
+COLOR_TOLERANCE = 2
+# A surface that leaves the plane through its neighbours by so much has an edge there.
+EDGE_M = 0.005
+# Growing every half extent by this moves no corner by more than a millimetre.
+NEARLY_TOUCHING_M = 0.001 / np.sqrt(3.0)
+PICTURE_SCENES = 4
+PICTURE_SIDE_PX = 240
+PICTURE_DIFFERENCE_M = 0.005
+TARGETS = {
+    "all_pixels": None,
+    "depth": 0.99,
+    "color": None,
+    "contacts": 0.995,
+    "contacts_or_near": 1.0,
+}
+
+Images = NDArray[Any]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What was found.
+
+    Attributes:
+        scenes: how many were compared.
+        motions: how many.
+        off_edges: share of the pixels that lie off edges; see `off_edges`.
+        all_pixels: share of all pixels that differ by no more than `DEPTH_TOLERANCE_M` of depth.
+        depth: the same of the pixels off edges.
+        color: share of the pixels off edges that differ by no more than `COLOR_TOLERANCE` levels.
+        contacts: share of the motions whose flags are the same.
+        contacts_or_near: the same, with those that PyBullet would change within a millimetre.
+        touched: share of the motions that did, by PyBullet.
+        collided: the same.
+    """
+
+    scenes: int
+    motions: int
+    off_edges: float
+    all_pixels: float
+    depth: float
+    color: float
+    contacts: float
+    contacts_or_near: float
+    touched: float
+    collided: float
+
+
+class Sample:
+    """Random scenes, and random poses and motions of the robots before them."""
+
+    def __init__(self, scenes: int, size: tuple[int, int], seed: int = 0):
+        width, height = size
+        self.rng = np.random.default_rng(seed)
+        cameras = {kind: Camera(type=kind, width=width, height=height) for kind in ("depth", "rgb")}
+        settings = GraspSettings(cameras=cameras)
+        limits = np.full(scenes, np.pi)
+        self.scenes, self.views = SceneSampler(settings).sample(self.rng, limits)
+        self.everywhere = np.arange(scenes)
+        self._arm = Arm(settings.workspace, settings.motion_checks)
+        self.start = self._arm.home(scenes)
+        self._advance()  # the home pose is out of the camera's sight
+
+    def _advance(self) -> NDArray[np.float64]:
+        """Goes on to random poses of the workspace; returns the joint paths there."""
+        actions = self.rng.uniform(-1.0, 1.0, (len(self.scenes), 4))
+        self.start, path, _ = self._arm.reach(self.start, actions)
+        return path
+
+    def paths(self, rounds: int) -> list[NDArray[np.float64]]:
+        """Joint paths (n, p, 6) of so many motions one after the other."""
+        return [self._advance() for _ in range(rounds)]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compares, prints a table, and writes a picture and JSON where asked."""
+    options = parse(arguments)
+    found, pictures = compare(options.scenes, options.motions, tuple(options.size), options.seed)
+    if options.picture is not None:
+        options.picture.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(options.picture), draw(*pictures))
+    if options.json is not None:
+        options.json.write_text(json.dumps(asdict(found), indent=2) + "\n")
+    Console().print(table(found))
+    met = [getattr(found, name) >= target for name, target in TARGETS.items() if target is not None]
+    return 0 if all(met) else 1
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Reads the command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.agreement", description=__doc__)
+    parser.add_argument("--scenes", type=int, default=500)
+    parser.add_argument("--motions", type=int, default=20, help="of each scene")
+    parser.add_argument("--size", type=int, nargs=2, default=[80, 80], metavar=("W", "H"))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the differences here")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here, too")
+    return parser.parse_args(arguments)
+
+
+def compare(
+    scenes: int, motions: int, size: tuple[int, int], seed: int = 0
+) -> tuple[Agreement, tuple[Images, Images]]:
+    """Compares the simulators.
+
+    Args:
+        scenes: how many.
+        motions: of each scene.
+        size: width and height of the pictures.
+        seed: of everything random.
+
+    Returns:
+        What was found, and the depths (n, H, W) in metres by PyBullet and by the fast simulator.
+    """
+    sample = Sample(scenes, size, seed)
+    exact, fast = (
+        photographs(simulator, sample) for simulator in (PyBulletSimulator, FastSimulator)
+    )
+    compared = off_edges(exact[0]) & off_edges(fast[0])
+    close = difference(exact[0], fast[0]) <= DEPTH_TOLERANCE_M
+    color = np.abs(exact[1].astype(int) - fast[1]).max(axis=-1) <= COLOR_TOLERANCE
+    paths = sample.paths(motions)
+    flags, near = compare_contacts(sample, paths)
+    agree = (flags[0] == flags[1]).all(axis=1)
+    found = Agreement(
+        scenes=scenes,
+        motions=len(agree),
+        off_edges=float(compared.mean()),
+        all_pixels=float(close.mean()),
+        depth=float(close[compared].mean()),
+        color=float(color[compared].mean()),
+        contacts=float(agree.mean()),
+        contacts_or_near=float((agree | near).mean()),
+        touched=float(flags[0][:, 0].mean()),
+        collided=float(flags[0][:, 1].mean()),
+    )
+    return found, (exact[0], fast[0])
+
+
+def photographs(make: Callable[[int, Support], Simulator], sample: Sample) -> tuple[Images, Images]:
+    """Depth (n, H, W) and color (n, H, W, 3) of the scenes, with the robots in view."""
+    simulator = make(len(sample.scenes), Support())
+    try:
+        simulator.load(sample.everywhere, sample.scenes, sample.start.joints_rad)
+        depth = simulator.render(sample.everywhere, sample.views["depth"])
+        # Where the depth camera stands, so that their pixels show the same.
+        views = Views(sample.views["rgb"].camera, **sample.views["depth"].arrays())
+        return depth, simulator.render(sample.everywhere, views)
+    finally:
+        simulator.close()
+
+
+def off_edges(depth: Images) -> Flags:
+    """Pixels (n, H, W) that lie, with their neighbours, on one smooth surface.
+
+    On a plane, the inverse depth is an affine function of the pixel, and its second differences
+    vanish; where they don't, there is an edge. The picture's border is compared as it is.
+    """
+    inverse = np.where(np.isfinite(depth), 1.0 / depth, 0.0)
+    padded = np.pad(inverse, ((0, 0), (1, 1), (1, 1)), mode="reflect", reflect_type="odd")
+    height, width = depth.shape[1:]
+    edge = np.zeros(depth.shape, bool)
+    for rows, columns in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        ahead, behind = (
+            padded[:, 1 + s * rows :, 1 + s * columns :][:, :height, :width] for s in (1, -1)
+        )
+        bend = np.abs(ahead + behind - 2.0 * inverse)
+        edge |= bend > EDGE_M * np.maximum(inverse, np.maximum(ahead, behind)) ** 2
+    return ~edge
+
+
+def difference(first: Images, second: Images) -> Images:
+    """Absolute differences of depths in metres; none where both see nothing."""
+    both_nothing = np.isinf(first) & np.isinf(second)
+    return np.abs(np.where(both_nothing, 0.0, first) - np.where(both_nothing, 0.0, second))
+
+
+def compare_contacts(
+    sample: Sample, paths: list[NDArray[np.float64]]
+) -> tuple[tuple[Flags, Flags], Flags]:
+    """What the motions touch.
+
+    Returns:
+        By PyBullet and by the fast simulator, whether motions touched and collided (m, 2); and
+        whether those that differ were about to do as the other says (m,).
+    """
+    exact, fast = (
+        contacts(simulator, sample, paths, 0.0) for simulator in (PyBulletSimulator, FastSimulator)
+    )
+    larger = contacts(PyBulletSimulator, sample, paths, NEARLY_TOUCHING_M)
+    smaller = contacts(PyBulletSimulator, sample, paths, -NEARLY_TOUCHING_M)
+    near = (smaller <= fast) & (fast <= larger)
+    return (exact, fast), np.asarray(near.all(axis=1))
+
+
+def contacts(
+    make: Callable[[int, Support], Simulator],
+    sample: Sample,
+    paths: list[NDArray[np.float64]],
+    grow_m: float,
+) -> Flags:
+    """Whether motions touched and collided (m, 2), with all boxes grown by `grow_m`."""
+    support = Support()
+    support = Support(
+        x_m=(support.x_m[0] - grow_m, support.x_m[1] + grow_m),
+        y_m=(support.y_m[0] - grow_m, support.y_m[1] + grow_m),
+        top_m=support.top_m + grow_m,
+        thickness_m=support.thickness_m + 2.0 * grow_m,
+    )
+    simulator = make(len(sample.scenes), support)
+    try:
+        simulator.load(sample.everywhere, grown(sample.scenes, grow_m), paths[0][:, 0])
+        found: list[Contacts] = [simulator.move(sample.everywhere, path) for path in paths]
+    finally:
+        simulator.close()
+    return np.concatenate([np.stack([c.touched, c.collided], axis=1) for c in found])
+
+
+def grown(scenes: Scenes, grow_m: float) -> Scenes:
+    """The same scenes with larger boxes."""
+    half = scenes.box_half_m
+    return scenes.with_arrays({"box_half_m": np.where(half > 0.0, half + grow_m, 0.0)})
+
+
+def draw(exact: Images, fast: Images) -> Images:
+    """Both depths and their difference, a row for each of the scenes that differ the most."""
+    error = difference(exact, fast)
+    worst = np.argsort(-(error > DEPTH_TOLERANCE_M).sum(axis=(1, 2)), kind="stable")
+    rows = []
+    for scene in worst[:PICTURE_SCENES]:
+        panels = [1.0 - np.clip((depth[scene] - 0.4) / 1.6, 0.0, 1.0) for depth in (exact, fast)]
+        panels.append(np.clip(error[scene] / PICTURE_DIFFERENCE_M, 0.0, 1.0))
+        images = []
+        maps = (cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_HOT)
+        for panel, colors in zip(panels, maps, strict=True):
+            image = cv2.applyColorMap((255.0 * panel).astype(np.uint8), colors)
+            side = (PICTURE_SIDE_PX * image.shape[1] // image.shape[0], PICTURE_SIDE_PX)
+            images.append(cv2.resize(image, side, interpolation=cv2.INTER_NEAREST))
+        rows.append(np.hstack(images))
+    return np.vstack(rows)
+
+
+def table(found: Agreement) -> Table:
+    """The figures for people."""
+    result = Table(title=f"fast against pybullet: {found.scenes} scenes, {found.motions} motions")
+    for column in ("", "agree", "at least"):
+        result.add_column(column, justify="right" if column else "left")
+    names = {
+        "all_pixels": f"pixels within {1000 * DEPTH_TOLERANCE_M:g} mm of depth",
+        "depth": f"pixels off edges within {1000 * DEPTH_TOLERANCE_M:g} mm of depth",
+        "color": f"pixels off edges within {COLOR_TOLERANCE} of 255 levels of color",
+        "contacts": "motions with the same contacts",
+        "contacts_or_near": "the same, or with shapes within 1 mm of it",
+    }
+    for name, target in TARGETS.items():
+        wanted = "" if target is None else f"{target:.1%}"
+        result.add_row(names[name], f"{getattr(found, name):.3%}", wanted)
+    result.caption = (
+        f"{found.off_edges:.0%} of the pixels are off edges; "
+        f"{found.touched:.0%} of the motions touch, {found.collided:.0%} collide"
+    )
+    return result
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

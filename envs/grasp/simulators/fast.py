@@ -1,0 +1,343 @@
+"""All worlds at once in compiled loops, spread over threads: the simulator to train with.
+
+It shows and feels what PyBullet does (`python -m benchmarks.agreement` measures how closely), but
+for the tessellation of cylinders, which are exact here.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from encoders.spaces import MM_PER_M, UINT8_MAX, DepthImage
+from envs.grasp.camera import Views, focal_length_px
+from envs.grasp.robot import Box, Robot, load_robot
+from envs.grasp.scene import Scenes
+from envs.grasp.settings import Support
+from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
+from envs.grasp.simulators.colors import BLOCK_RGBA, SUPPORT_RGBA
+from envs.grasp.simulators.kernels.contacts import touch_along
+from envs.grasp.simulators.kernels.pictures import (
+    Sensor,
+    ViewArrays,
+    take_pictures,
+)
+from envs.grasp.simulators.kernels.worlds import RobotArrays, WorldArrays
+
+CUP = "cup"
+ORTHONORMAL_TOLERANCE = 1e-6
+# Pictures that are not asked for.
+NO_DEPTHS = np.empty((0, 0, 0), np.float32)
+NO_COLORS = np.empty((0, 0, 0, 3), np.uint8)
+NO_CODES = np.empty((0, 0, 0), np.uint16)
+NO_SENSOR = Sensor(np.empty(0), np.empty(0, np.uint64), 0.0, 0.0, 0.0, 0.0)
+
+
+class FastSimulator:
+    """N worlds in this process. Implements `envs.grasp.simulators.base.Simulator`.
+
+    Args:
+        num_worlds: N.
+        support: the table.
+        threads: among which the worlds are divided; None: one for each core.
+
+    Raises:
+        ValueError: `threads` is not in the range of what there is.
+    """
+
+    def __init__(self, num_worlds: int, support: Support, threads: int | None = None):
+        most = numba.get_num_threads()
+        self._threads = most if threads is None else threads
+        if not 1 <= self._threads <= most:
+            raise ValueError(f"{threads} threads: there must be 1 to {most}")
+        self._robot = robot_arrays(load_robot())
+        self._num_worlds, self._support = num_worlds, support
+        self._worlds = _empty_worlds(num_worlds, 1, len(self._robot.axes))
+        self._loaded = np.zeros(num_worlds, bool)
+
+    def load(self, indices: Indices, scenes: Scenes, joints_rad: Floats) -> None:
+        """See `Simulator.load`.
+
+        Raises:
+            ValueError: a number is not finite, or a box has a side that is not positive.
+        """
+        indices = self._checked(indices)
+        _check_scenes(scenes, len(indices))
+        _check(joints_rad, (len(indices), len(self._robot.axes)), "joints_rad")
+        blocks, boxes = scenes.box_half_m.shape[1:3]
+        self._reserve(1 + blocks * boxes)
+        worlds, count = self._worlds, 1 + blocks * boxes
+        center, axes, half = _boxes(scenes)
+        worlds.half[indices, count:] = 0.0
+        worlds.radius[indices, count:] = 0.0
+        worlds.center[indices, 1:count], worlds.half[indices, 1:count] = center, half
+        worlds.axes[indices, 1:count] = axes
+        worlds.radius[indices, 1:count] = np.linalg.norm(half, axis=-1)
+        worlds.low[indices], worlds.high[indices] = _room(worlds, indices)
+        worlds.is_target[indices, 1 : 1 + boxes] = True
+        worlds.is_target[indices, 1 + boxes :] = False
+        colors = [BLOCK_RGBA[number % len(BLOCK_RGBA)] for number in range(blocks)]
+        worlds.colors[indices, 1:count] = np.repeat(_color_levels(colors), boxes, axis=0)
+        length = np.linalg.norm(scenes.light_direction, axis=1, keepdims=True)
+        worlds.light[indices] = scenes.light_direction / length
+        worlds.diffuse[indices] = scenes.light_intensity
+        worlds.joints[indices, 0] = joints_rad
+        self._loaded[indices] = True
+
+    def move(self, indices: Indices, path_rad: Floats) -> Contacts:
+        """See `Simulator.move`.
+
+        Raises:
+            ValueError: a joint angle is not finite, or a world holds no scene.
+        """
+        indices = self._checked(indices, loaded=True)
+        if np.ndim(path_rad) != 3 or np.shape(path_rad)[1] < 1:
+            raise ValueError(f"a path has the shape (n, p, J), p at least 1, not {path_rad.shape}")
+        shape = (len(indices), path_rad.shape[1], len(self._robot.axes))
+        _check(path_rad, shape, "path_rad")
+        touched, collided = np.zeros(len(indices), bool), np.zeros(len(indices), bool)
+        path = np.ascontiguousarray(path_rad, np.float64)
+        touch_along(self._robot, self._worlds, indices, path, self._threads, touched, collided)
+        self._worlds.joints[indices, 0] = path[:, -1]
+        return Contacts(touched, collided)
+
+    def render(self, indices: Indices, views: Views) -> Images:
+        """See `Simulator.render`.
+
+        Raises:
+            ValueError: a view is not possible, or a world holds no scene.
+        """
+        indices, arrays = self._checked(indices, loaded=True), _view_arrays(views, len(indices))
+        size = (len(indices), arrays.height, arrays.width)
+        is_color = views.camera.type == "rgb"
+        depths = NO_DEPTHS if is_color else np.empty(size, np.float32)
+        colors = np.empty((*size, 3), np.uint8) if is_color else NO_COLORS
+        self._take_pictures(indices, arrays, NO_SENSOR, depths, colors, NO_CODES)
+        return colors if is_color else depths
+
+    def sense(
+        self, indices: Indices, views: Views, space: DepthImage, seeds: NDArray[np.uint64]
+    ) -> Images:
+        """See `Simulator.sense`.
+
+        Raises:
+            ValueError: a view is not possible, the space has another size than the camera, or a
+                world holds no scene.
+        """
+        indices, arrays = self._checked(indices, loaded=True), _view_arrays(views, len(indices))
+        if space.shape != (arrays.height, arrays.width, 1):
+            raise ValueError(
+                f"the space is {space}, but the camera takes {arrays.width}x{arrays.height} "
+                "(width x height)"
+            )
+        if np.shape(seeds) != indices.shape:
+            raise ValueError(f"{len(indices)} pictures need as many seeds, not {np.shape(seeds)}")
+        _check(views.noise_sigma_m, indices.shape, "noise_sigma_m")
+        codes = np.empty((len(indices), arrays.height, arrays.width), np.uint16)
+        sensor = _sensor(views.noise_sigma_m, seeds, space)
+        self._take_pictures(indices, arrays, sensor, NO_DEPTHS, NO_COLORS, codes)
+        return codes[..., None].astype(space.dtype, copy=False)
+
+    def close(self) -> None:
+        """See `Simulator.close`."""
+
+    def _take_pictures(
+        self,
+        indices: Indices,
+        views: ViewArrays,
+        sensor: Sensor,
+        depths: NDArray[np.float32],
+        colors: NDArray[np.uint8],
+        codes: NDArray[np.uint16],
+    ) -> None:
+        """Fills pictures (n, H, W) and (n, H, W, 3); those that are not asked for are empty."""
+        pixels = views.height * views.width
+        take_pictures(
+            self._robot,
+            self._worlds,
+            indices,
+            views,
+            sensor,
+            self._threads,
+            depths.reshape(len(depths), pixels if len(depths) else 0),
+            colors.reshape(len(colors), pixels if len(colors) else 0, 3),
+            codes.reshape(len(codes), pixels if len(codes) else 0),
+        )
+
+    def _checked(self, indices: Indices, loaded: bool = False) -> Indices:
+        """The indices as compiled loops take them, which look at no limits themselves."""
+        indices = np.ascontiguousarray(indices, np.int64)
+        known = (indices >= 0) & (indices < self._num_worlds)
+        if indices.ndim != 1 or not known.all() or (np.diff(indices) <= 0).any():
+            raise ValueError(
+                f"indices must rise from 0 or more to under {self._num_worlds}, not {indices}"
+            )
+        if loaded and not self._loaded[indices].all():
+            missing = indices[~self._loaded[indices]]
+            raise ValueError(f"worlds {missing.tolist()} hold no scene yet: load one first")
+        return indices
+
+    def _reserve(self, boxes: int) -> None:
+        """Makes room for so many boxes a world, of which the first is the support."""
+        before = self._worlds
+        if self._loaded.any() and before.half.shape[1] >= boxes:
+            return
+        self._worlds = _empty_worlds(self._num_worlds, boxes, len(self._robot.axes))
+        for old, new in zip(before, self._worlds, strict=True):
+            # Only the axis of the boxes, if any, has another length.
+            new[tuple(slice(size) for size in old.shape)] = old
+        support, worlds = self._support, self._worlds
+        (x_low, x_high), (y_low, y_high) = support.x_m, support.y_m
+        low = np.array([x_low, y_low, support.top_m - support.thickness_m])
+        high = np.array([x_high, y_high, support.top_m])
+        worlds.center[:, 0], worlds.half[:, 0] = (low + high) / 2, (high - low) / 2
+        worlds.radius[:, 0] = np.linalg.norm(high - low) / 2
+        worlds.axes[:, 0] = np.eye(3)
+        worlds.colors[:, 0] = _color_levels([SUPPORT_RGBA])[0]
+
+
+def robot_arrays(robot: Robot) -> RobotArrays:
+    """The robot as the kernels take it."""
+    shapes = [
+        (link, shape) for link, shapes in enumerate(robot.link_primitives) for shape in shapes
+    ]
+    half = np.array(
+        [
+            shape.half_extents_m
+            if isinstance(shape, Box)
+            else (shape.radius_m, shape.radius_m, shape.length_m / 2)
+            for _, shape in shapes
+        ]
+    )
+    is_cylinder = np.array([not isinstance(shape, Box) for _, shape in shapes])
+    links = np.array([link for link, _ in shapes], np.int64)
+    # A cylinder's ball goes through its rims, not through the corners of the box about it.
+    corner = np.where(is_cylinder[:, None], half * [1.0, 0.0, 1.0], half)
+    return RobotArrays(
+        parents=np.array(robot.link_parents, np.int64),
+        joints=np.array(robot.link_joints, np.int64),
+        origins=np.ascontiguousarray(robot.link_origins),
+        axes=np.ascontiguousarray(robot.joint_axes),
+        shape_links=links,
+        shape_poses=np.array([shape.pose for _, shape in shapes]),
+        shape_half=half,
+        shape_radius=np.linalg.norm(corner, axis=1),
+        is_cylinder=is_cylinder,
+        is_cup=links == robot.link_names.index(CUP),
+        shape_colors=_color_levels(robot.link_colors[links]),
+    )
+
+
+def _empty_worlds(worlds: int, boxes: int, joints: int) -> WorldArrays:
+    return WorldArrays(
+        center=np.zeros((worlds, boxes, 3)),
+        axes=np.zeros((worlds, boxes, 3, 3)),
+        half=np.zeros((worlds, boxes, 3)),
+        radius=np.zeros((worlds, boxes)),
+        low=np.zeros((worlds, 3)),
+        high=np.zeros((worlds, 3)),
+        is_target=np.zeros((worlds, boxes), bool),
+        colors=np.zeros((worlds, boxes, 3)),
+        light=np.zeros((worlds, 3)),
+        diffuse=np.zeros(worlds),
+        joints=np.zeros((worlds, 1, joints)),
+    )
+
+
+def _boxes(scenes: Scenes) -> tuple[Floats, Floats, Floats]:
+    """Centres (n, k, 3), axes (n, k, 3, 3) and half extents (n, k, 3) in the world frame."""
+    n, blocks, boxes = scenes.box_half_m.shape[:3]
+    cosine, sine = np.cos(scenes.block_yaw_rad), np.sin(scenes.block_yaw_rad)
+    turn = np.zeros((n, blocks, 3, 3))
+    turn[..., 0, 0], turn[..., 0, 1], turn[..., 1, 0], turn[..., 1, 1] = cosine, -sine, sine, cosine
+    turn[..., 2, 2] = 1.0
+    center = scenes.block_position_m[:, :, None] + np.matmul(
+        scenes.box_center_m, np.swapaxes(turn, -1, -2)
+    )
+    axes = np.broadcast_to(turn[:, :, None], (n, blocks, boxes, 3, 3))
+    return (
+        center.reshape(n, -1, 3),
+        axes.reshape(n, -1, 3, 3),
+        scenes.box_half_m.reshape(n, -1, 3),
+    )
+
+
+def _room(worlds: WorldArrays, indices: Indices) -> tuple[Floats, Floats]:
+    """Lower and upper ends (n, 3) of the room that all boxes of some worlds take."""
+    center, half = worlds.center[indices], worlds.half[indices]
+    reach = np.matmul(np.abs(worlds.axes[indices]), half[..., None])[..., 0]
+    there = worlds.radius[indices, :, None] > 0.0
+    low = np.where(there, center - reach, np.inf).min(axis=1)
+    return low, np.where(there, center + reach, -np.inf).max(axis=1)
+
+
+def _view_arrays(views: Views, n: int) -> ViewArrays:
+    """Views as the kernels take them; there must be n, all possible ones."""
+    _check(views.position_m, (n, 3), "position_m of the views")
+    _check(views.rotation, (n, 3, 3), "rotation of the views")
+    _check(views.near_m, (n,), "near_m of the views")
+    _check(views.far_m, (n,), "far_m of the views")
+    square = np.matmul(np.swapaxes(views.rotation, 1, 2), views.rotation)
+    if (np.abs(square - np.eye(3)) > ORTHONORMAL_TOLERANCE).any():
+        raise ValueError("rotation of the views must be rotations: orthonormal columns")
+    if not ((views.near_m > 0.0) & (views.near_m < views.far_m)).all():
+        raise ValueError("near_m of the views must be over 0 and under far_m")
+    camera = views.camera
+    return ViewArrays(
+        np.ascontiguousarray(views.position_m, np.float64),
+        np.ascontiguousarray(views.rotation, np.float64),
+        np.ascontiguousarray(views.near_m, np.float64),
+        np.ascontiguousarray(views.far_m, np.float64),
+        focal_length_px(camera),
+        camera.width,
+        camera.height,
+    )
+
+
+def _sensor(sigma_m: Floats, seeds: NDArray[np.uint64], space: DepthImage) -> Sensor:
+    """The sensor of n pictures, with what `DepthImage.encode` does in numbers."""
+    low, high = space.range_m
+    zero, scale = (low, UINT8_MAX / (high - low)) if space.encoding == "uint8" else (0.0, MM_PER_M)
+    return Sensor(
+        np.ascontiguousarray(sigma_m, np.float64),
+        np.ascontiguousarray(seeds, np.uint64),
+        low,
+        high,
+        zero,
+        float(scale),
+    )
+
+
+def _color_levels(rgb: object) -> Floats:
+    """Colors in [0, 1], with or without alpha, as whole levels in [0, 255] (n, 3)."""
+    return np.floor(255.0 * np.asarray(rgb, np.float64)[:, :3])
+
+
+def _check_scenes(scenes: Scenes, n: int) -> None:
+    if scenes.box_half_m.ndim != 4 or len(scenes) != n:
+        raise ValueError(
+            f"{n} worlds need {n} scenes with boxes (n, B, k, 3), not {scenes.box_half_m.shape}"
+        )
+    blocks = scenes.box_half_m.shape[1]
+    _check(scenes.box_center_m, scenes.box_half_m.shape, "box_center_m of the scenes")
+    _check(scenes.box_half_m, (n, *scenes.box_half_m.shape[1:3], 3), "box_half_m of the scenes")
+    _check(scenes.block_position_m, (n, blocks, 3), "block_position_m of the scenes")
+    _check(scenes.block_yaw_rad, (n, blocks), "block_yaw_rad of the scenes")
+    _check(scenes.light_direction, (n, 3), "light_direction of the scenes")
+    _check(scenes.light_intensity, (n,), "light_intensity of the scenes")
+    sides = scenes.box_half_m > 0.0
+    if not (sides.all(axis=-1) | (scenes.box_half_m == 0.0).all(axis=-1)).all():
+        raise ValueError(
+            "box_half_m of the scenes: a box has three sides over 0, or all 0 where there is none"
+        )
+    if not scenes.light_direction.any(axis=1).all():
+        raise ValueError("light_direction of the scenes must have a length")
+
+
+def _check(array: Floats, shape: tuple[int, ...], name: str) -> None:
+    if np.shape(array) != shape:
+        raise ValueError(f"{name} must be of shape {shape}, not {np.shape(array)}")
+    if not np.isfinite(array).all():
+        count = np.count_nonzero(~np.isfinite(array))
+        raise ValueError(f"{name} must be finite, but {count} of its numbers are not")
