@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for mode in MODES
         for num_envs in options.num_envs
     ]
-    report = {"cores": len(os.sched_getaffinity(0)), "simulator": "pybullet", "rows": rows}
+    report = {"cores": len(os.sched_getaffinity(0)), "simulator": options.simulator, "rows": rows}
     if options.json is not None:
         options.json.write_text(json.dumps(report, indent=2) + "\n")
     Console().print(table(report))
@@ -43,6 +43,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.throughput", description=__doc__)
     parser.add_argument("--sizes", type=int, nargs="+", default=[80], help="image sides in pixels")
     parser.add_argument("--num-envs", type=int, nargs="+", default=[64])
+    parser.add_argument("--simulator", choices=("pybullet", "fast"), default="pybullet")
     parser.add_argument("--repeats", type=int, default=5, help="the median of them is reported")
     parser.add_argument("--seconds", type=float, default=5.0, help="of one repeat, at least")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here, too")
@@ -56,14 +57,15 @@ def measure(mode: str, size: int, num_envs: int, options: argparse.Namespace) ->
         rewards=dict.fromkeys(ventosa_rewards(), 1.0),
         cameras={"depth": Camera(type="depth", width=size, height=size)},
         frame_grab=MODES[mode],
+        simulator=options.simulator,
     )
-    rng = np.random.default_rng(0)
+    rng, stream = np.random.default_rng(0), not MODES[mode]
     speeds = []
     try:
         env.reset()
-        play(env, rng, seconds=1.0)
+        play(env, rng, 1.0, stream=stream)
         for _ in range(options.repeats):
-            speeds.append(play(env, rng, options.seconds))
+            speeds.append(play(env, rng, options.seconds, stream=stream))
     finally:
         env.close()
     steps, frames = (statistics.median(values) for values in zip(*speeds, strict=True))
@@ -78,13 +80,20 @@ def measure(mode: str, size: int, num_envs: int, options: argparse.Namespace) ->
     }
 
 
-def play(env: Any, rng: np.random.Generator, seconds: float) -> tuple[float, float]:
-    """Takes random actions for a while; returns steps and new frames per second."""
+def play(
+    env: Any, rng: np.random.Generator, seconds: float, *, stream: bool
+) -> tuple[float, float]:
+    """Takes random actions for a while; returns steps and frames per second.
+
+    A stream has two frames where an episode ends: its last, and the first of the next.
+    """
     start, steps, frames = time.perf_counter(), 0, 0
     while (elapsed := time.perf_counter() - start) < seconds:
         *_, infos = env.step(rng.uniform(-1.0, 1.0, (env.num_envs, 4)))
         steps += env.num_envs
         frames += int(np.count_nonzero(~infos["same_frame"]))
+        if stream and "_final_obs" in infos:
+            frames += int(np.count_nonzero(infos["_final_obs"]))
     return steps / elapsed, frames / elapsed
 
 

@@ -3,11 +3,11 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 
@@ -24,6 +24,7 @@ from envs.grasp.simulators.fast import FastSimulator
 from envs.grasp.simulators.kernels.contacts import Room, boxes_meet, cylinder_meets_box
 from envs.grasp.simulators.kernels.noise import fill_normals, threefry
 from envs.grasp.simulators.pybullet import PyBulletSimulator
+from envs.grasp.simulators.team import Team
 
 ROOT = Path(__file__).parents[2]
 ROBOT = load_robot()
@@ -421,7 +422,7 @@ def test_results_do_not_depend_on_threads_nor_on_the_company() -> None:
     scenes, views = sampled(9, 0, **cameras)
     results = everything(loaded(scenes, threads=1), scenes, views)
     assert 0 < results[0].sum() < 9
-    for threads in range(2, numba.get_num_threads() + 1):
+    for threads in (2, 3):
         for one, many in zip(
             results, everything(loaded(scenes, threads), scenes, views), strict=True
         ):
@@ -431,6 +432,35 @@ def test_results_do_not_depend_on_threads_nor_on_the_company() -> None:
         alone = loaded(scenes[i : i + 1])
         assert alone.move(FIRST, reaching(scenes)[i : i + 1]).touched[0] == results[0][i]
         np.testing.assert_array_equal(alone.render(FIRST, views["rgb"][i : i + 1])[0], again[3][i])
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("rows", [0, 1, 8, 9, 100, 1023])
+def test_a_team_does_every_row_once(threads: int, rows: int) -> None:
+    team, done = Team(threads), np.zeros(rows, int)
+
+    def work(begin: int, end: int) -> None:
+        assert 0 <= begin <= end <= rows
+        done[begin:end] += 1
+
+    team.share(work, rows)
+    team.close()
+    team.close()
+    np.testing.assert_array_equal(done, 1)
+
+
+def test_a_teams_members_work_at_the_same_time_and_their_errors_are_passed_on() -> None:
+    team, meeting = Team(2), threading.Barrier(2, timeout=10.0)
+    team.share(lambda begin, end: print(meeting.wait()), 16)  # two parts: nobody works alone
+
+    def fail(begin: int, end: int) -> None:
+        meeting.wait()
+        if begin:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        team.share(fail, 16)
+    team.close()
 
 
 def test_a_thousand_worlds() -> None:
@@ -507,8 +537,8 @@ def test_bad_input_is_refused_with_its_name() -> None:
     fresh.load(FIRST, scenes[:1], home(1))
     with pytest.raises(ValueError, match=r"worlds \[1\] hold no scene"):
         fresh.move(both, path)
-    with pytest.raises(ValueError, match="99 threads"):
-        FastSimulator(2, Support(), threads=99)
+    with pytest.raises(ValueError, match="0 threads"):
+        FastSimulator(2, Support(), threads=0)
 
 
 # -- in the environment ----------------------------------------------------------------------------

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 
-import numba
-
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.base import Simulator
 from envs.grasp.simulators.fast import FastSimulator
@@ -38,7 +36,5 @@ def _fast(settings: GraspSettings, num_worlds: int, window: bool) -> FastSimulat
         raise ValueError(
             "simulator: fast has no window: use simulator: pybullet, or render_mode: rgb_array"
         )
-    threads = settings.workers
-    if threads is not None:
-        threads = min(max(threads, 1), numba.get_num_threads())
+    threads = None if settings.workers is None else max(settings.workers, 1)
     return FastSimulator(num_worlds, settings.support, threads)

@@ -6,7 +6,9 @@ for the tessellation of cylinders, which are exact here.
 
 from __future__ import annotations
 
-import numba
+import os
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +26,7 @@ from envs.grasp.simulators.kernels.pictures import (
     take_pictures,
 )
 from envs.grasp.simulators.kernels.worlds import RobotArrays, WorldArrays
+from envs.grasp.simulators.team import Team
 
 CUP = "cup"
 ORTHONORMAL_TOLERANCE = 1e-6
@@ -43,14 +46,13 @@ class FastSimulator:
         threads: among which the worlds are divided; None: one for each core.
 
     Raises:
-        ValueError: `threads` is not in the range of what there is.
+        ValueError: `threads` is less than one.
     """
 
     def __init__(self, num_worlds: int, support: Support, threads: int | None = None):
-        most = numba.get_num_threads()
-        self._threads = most if threads is None else threads
-        if not 1 <= self._threads <= most:
-            raise ValueError(f"{threads} threads: there must be 1 to {most}")
+        if threads is not None and threads < 1:
+            raise ValueError(f"{threads} threads: there must be at least 1")
+        self._team = Team(len(os.sched_getaffinity(0)) if threads is None else threads)
         self._robot = robot_arrays(load_robot())
         self._num_worlds, self._support = num_worlds, support
         self._worlds = _empty_worlds(num_worlds, 1, len(self._robot.axes))
@@ -98,7 +100,8 @@ class FastSimulator:
         _check(path_rad, shape, "path_rad")
         touched, collided = np.zeros(len(indices), bool), np.zeros(len(indices), bool)
         path = np.ascontiguousarray(path_rad, np.float64)
-        touch_along(self._robot, self._worlds, indices, path, self._threads, touched, collided)
+        touch = partial(touch_along, self._robot, self._worlds, indices, path, touched, collided)
+        self._team.share(touch, len(indices))
         self._worlds.joints[indices, 0] = path[:, -1]
         return Contacts(touched, collided)
 
@@ -141,6 +144,7 @@ class FastSimulator:
 
     def close(self) -> None:
         """See `Simulator.close`."""
+        self._team.close()
 
     def _take_pictures(
         self,
@@ -153,17 +157,18 @@ class FastSimulator:
     ) -> None:
         """Fills pictures (n, H, W) and (n, H, W, 3); those that are not asked for are empty."""
         pixels = views.height * views.width
-        take_pictures(
+        take = partial(
+            take_pictures,
             self._robot,
             self._worlds,
             indices,
             views,
             sensor,
-            self._threads,
             depths.reshape(len(depths), pixels if len(depths) else 0),
             colors.reshape(len(colors), pixels if len(colors) else 0, 3),
             codes.reshape(len(codes), pixels if len(codes) else 0),
         )
+        self._team.share(take, len(indices))
 
     def _checked(self, indices: Indices, loaded: bool = False) -> Indices:
         """The indices as compiled loops take them, which look at no limits themselves."""

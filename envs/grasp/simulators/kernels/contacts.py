@@ -8,7 +8,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 
 from envs.grasp.simulators.kernels.worlds import (
     Bools,
@@ -50,38 +49,38 @@ class Room(NamedTuple):
     points: Floats
 
 
-@kernel(parallel=True)
+@kernel(nogil=True)
 def touch_along(
     robot: RobotArrays,
     worlds: WorldArrays,
     indices: Integers,
     paths: Floats,
-    threads: int,
     touched: Bools,
     collided: Bools,
+    begin: int,
+    end: int,
 ) -> None:
-    """Tells what n robots touch along joint poses; where they stand is left as it is.
+    """Tells what robots touch along joint poses; where they stand is left as it is.
 
     Args:
         robot: the robot.
         worlds: where the boxes are.
         indices: (n,) the worlds.
         paths: (n, p, J) joint angles in radians.
-        threads: how many threads share the work.
-        touched: (n,) result, see `envs.grasp.simulators.base.Contacts`.
-        collided: (n,) result.
+        touched: (n,) written, see `envs.grasp.simulators.base.Contacts`.
+        collided: (n,) written.
+        begin: first row that is meant.
+        end: row before which to end.
     """
-    for thread in prange(threads):
-        room = Room(
-            np.empty((len(robot.parents), 3, 4)),
-            np.empty(3),
-            np.empty((3, 3)),
-            np.empty((3, 3)),
-            np.empty((2 * BOX_EDGES, 2)),
-        )
-        for row in range(thread, len(indices), threads):
-            flags = _contacts(robot, worlds, indices[row], paths, row, room)
-            touched[row], collided[row] = flags
+    room = Room(
+        np.empty((len(robot.parents), 3, 4)),
+        np.empty(3),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((2 * BOX_EDGES, 2)),
+    )
+    for row in range(begin, end):
+        touched[row], collided[row] = _contacts(robot, worlds, indices[row], paths, row, room)
 
 
 @kernel()

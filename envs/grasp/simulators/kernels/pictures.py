@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from envs.grasp.simulators.kernels.noise import fill_normals
@@ -80,19 +79,20 @@ class Sensor(NamedTuple):
     codes_per_m: float
 
 
-@kernel(parallel=True)
+@kernel(nogil=True)
 def take_pictures(
     robot: RobotArrays,
     worlds: WorldArrays,
     indices: Integers,
     views: ViewArrays,
     sensor: Sensor,
-    threads: int,
     depths: NDArray[np.float32],
     colors: NDArray[np.uint8],
     codes: NDArray[np.uint16],
+    begin: int,
+    end: int,
 ) -> None:
-    """Takes a picture in each of n worlds. One kernel for all kinds: it takes long to compile.
+    """Takes a picture in each of some worlds. One kernel for all kinds: it takes long to compile.
 
     Args:
         robot: the robot.
@@ -100,26 +100,26 @@ def take_pictures(
         indices: (n,) the worlds.
         views: the cameras.
         sensor: for the codes.
-        threads: how many threads share the work.
         depths: (n, H * W) written: metres, infinite where nothing is seen. Empty where they are not
             asked for, as the following are.
         colors: (n, H * W, 3) written: RGB.
         codes: (n, H * W) written: what the sensor delivers.
+        begin: first row that is meant.
+        end: row before which to end.
     """
-    for thread in prange(threads):
-        picture = canvas(views.height, views.width, len(colors) > 0)
-        frames = np.empty((len(robot.parents), 3, 4))
-        normals = np.zeros((views.height * views.width + 1) // 2 * 2, np.float32)
-        for row in range(thread, len(indices), threads):
-            _draw_world(picture, robot, worlds, indices[row], views, row, frames)
-            if len(depths):
-                _to_depth(picture.inverse, depths[row])
-            if len(colors):
-                _to_color(picture.colors, colors[row])
-            if len(codes):
-                if sensor.sigma_m[row] > 0.0:
-                    fill_normals(sensor.seeds[row], normals)
-                _to_codes(picture.inverse, normals, row, sensor, codes[row])
+    picture = canvas(views.height, views.width, len(colors) > 0)
+    frames = np.empty((len(robot.parents), 3, 4))
+    normals = np.zeros((views.height * views.width + 1) // 2 * 2, np.float32)
+    for row in range(begin, end):
+        _draw_world(picture, robot, worlds, indices[row], views, row, frames)
+        if len(depths):
+            _to_depth(picture.inverse, depths[row])
+        if len(colors):
+            _to_color(picture.colors, colors[row])
+        if len(codes):
+            if sensor.sigma_m[row] > 0.0:
+                fill_normals(sensor.seeds[row], normals)
+            _to_codes(picture.inverse, normals, row, sensor, codes[row])
 
 
 @kernel()

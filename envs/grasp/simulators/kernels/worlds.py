@@ -24,8 +24,6 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
 
     Every array that is sliced or given to a function costs two atomic additions, to its counter of
     references, and a tuple of arrays as many as it has: inner loops are given single arrays only.
-    With `parallel=True`, numba drops what is written to an array that is a tuple's member: such a
-    kernel writes to its own arguments only.
 
     Args:
         options: more of `numba.njit`'s.
