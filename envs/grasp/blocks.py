@@ -18,7 +18,6 @@ Floats = NDArray[np.float64]
 
 PARALLELEPIPED, L_SHAPE, U_SHAPE = 0, 1, 2
 SHAPE_CODES = {"parallelepiped": PARALLELEPIPED, "L": L_SHAPE, "U": U_SHAPE}
-BOXES_PER_BLOCK = 3
 
 # A cup of 60 mm seals with its rim on the face also when it sits 10 mm beside the grasp point.
 DISC_RADIUS_M = 0.04
