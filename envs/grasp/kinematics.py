@@ -7,8 +7,10 @@ spherical wrist, whose three axes meet in one point, so that position and orient
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from envs.grasp.robot import Robot
@@ -77,27 +79,8 @@ def grasp_pose(tooltip_m: np.ndarray, yaw_rad: np.ndarray) -> np.ndarray:
     return pose
 
 
-def inverse(
-    robot: Robot, tooltip_m: np.ndarray, yaw_rad: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Joint angles that bring the tool to `grasp_pose(tooltip_m, yaw_rad)`.
-
-    Args:
-        robot: A robot built like the KR 16.
-        tooltip_m: (..., 3) centre of the cup's face in the world.
-        yaw_rad: (...) heading of the tool about the vertical.
-
-    Returns:
-        As `inverse_pose`.
-
-    Raises:
-        ValueError: The robot is built in another way.
-    """
-    return inverse_pose(robot, grasp_pose(tooltip_m, yaw_rad))
-
-
-def inverse_pose(robot: Robot, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Joint angles that bring the tooltip's frame to a pose.
+class InverseKinematics:
+    """Joint angles for poses of the tool.
 
     Of the up to eight solutions it takes always the same one: A1 faces the wrist, the elbow is up,
     and A5 is not positive. A forearm that slopes down to a tool held level has A5 < 0, so over the
@@ -105,24 +88,42 @@ def inverse_pose(robot: Robot, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
     Args:
         robot: A robot built like the KR 16.
-        pose: (..., 4, 4) the tooltip's frame in the world.
-
-    Returns:
-        The joint angles (..., 6) in radians, always finite and within the limits, and whether they
-        reach the pose (...), bool. Where they don't, they are those of the arm stretched or folded
-        towards it as far as it goes, clipped to the limits.
 
     Raises:
         ValueError: The robot is built in another way.
     """
-    arm = _Arm.of(robot)
-    pose = np.asarray(pose, dtype=np.float64)
-    last_link = pose @ np.linalg.inv(robot.tooltip)
-    a1, a2, a3, attainable = arm.place_wrist(last_link[..., :3, 3])
-    wrist = np.swapaxes(_forearm_rotation(a1, a2 + a3), -1, -2) @ last_link[..., :3, :3]
-    joints = np.stack([a1, a2, a3, *_turn_wrist(wrist)], axis=-1)
-    within = (joints >= robot.lower_rad - _SLACK) & (joints <= robot.upper_rad + _SLACK)
-    return np.clip(joints, robot.lower_rad, robot.upper_rad), attainable & within.all(axis=-1)
+
+    def __init__(self, robot: Robot):
+        self._arm = _arm(robot)
+        self._last_link = np.linalg.inv(robot.tooltip)
+        self._lower_rad, self._upper_rad = robot.lower_rad, robot.upper_rad
+
+    def __call__(self, tooltip_m: np.ndarray, yaw_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Joint angles that bring the tool to `grasp_pose(tooltip_m, yaw_rad)`; see `of_pose`.
+
+        Args:
+            tooltip_m: (..., 3) centre of the cup's face in the world.
+            yaw_rad: (...) heading of the tool about the vertical.
+        """
+        return self.of_pose(grasp_pose(tooltip_m, yaw_rad))
+
+    def of_pose(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Joint angles that bring the tooltip's frame to a pose.
+
+        Args:
+            pose: (..., 4, 4) the tooltip's frame in the world.
+
+        Returns:
+            The joint angles (..., 6) in radians, always finite and within the limits, and whether
+            they reach the pose (...), bool. Where they don't, they are those of the arm stretched
+            or folded towards it as far as it goes, clipped to the limits.
+        """
+        frames = np.asarray(pose, np.float64) @ self._last_link
+        joints, near_enough = np.empty((*frames.shape[:-2], 6)), np.empty(frames.shape[:-2], bool)
+        _solve(self._arm, frames.reshape(-1, 4, 4), joints.reshape(-1, 6), near_enough.reshape(-1))
+        within = (joints >= self._lower_rad - _SLACK) & (joints <= self._upper_rad + _SLACK)
+        reached = near_enough & within.all(axis=-1)
+        return np.clip(joints, self._lower_rad, self._upper_rad), reached
 
 
 def joint_path(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
@@ -155,8 +156,7 @@ def motion_duration_s(robot: Robot, start: np.ndarray, end: np.ndarray) -> np.nd
     return np.max(np.abs(np.asarray(end) - np.asarray(start)) / robot.max_speed_rad_s, axis=-1)
 
 
-@dataclass(frozen=True)
-class _Arm:
+class _Arm(NamedTuple):
     """The lengths (m) that place the wrist's centre."""
 
     height: float
@@ -165,75 +165,83 @@ class _Arm:
     forearm: float
     forearm_rise: float
 
-    @classmethod
-    def of(cls, robot: Robot) -> _Arm:
-        moved = [link for link, joint in enumerate(robot.link_joints) if joint >= 0]
-        origins = robot.link_origins[moved]
-        offsets = origins[:, :3, 3]
-        # What a KR 16 has; everything else must be zero for the closed form to hold.
-        free = np.zeros((6, 3), dtype=bool)
-        free[[0, 1, 2, 3, 3], [2, 0, 0, 0, 2]] = True
-        alike = (
-            robot.joint_axes.shape == (6, 3)
-            and np.allclose(robot.joint_axes, _AXES)
-            and np.allclose(origins[:, :3, :3], np.eye(3))
-            and np.allclose(offsets[~free], 0.0)
+
+def _arm(robot: Robot) -> _Arm:
+    moved = [link for link, joint in enumerate(robot.link_joints) if joint >= 0]
+    origins = robot.link_origins[moved]
+    offsets = origins[:, :3, 3]
+    # What a KR 16 has; everything else must be zero for the closed form to hold.
+    free = np.zeros((6, 3), dtype=bool)
+    free[[0, 1, 2, 3, 3], [2, 0, 0, 0, 2]] = True
+    alike = (
+        robot.joint_axes.shape == (6, 3)
+        and np.allclose(robot.joint_axes, _AXES)
+        and np.allclose(origins[:, :3, :3], np.eye(3))
+        and np.allclose(offsets[~free], 0.0)
+    )
+    if not alike:
+        raise ValueError(
+            f"{robot.path}: the closed-form inverse needs axes and a spherical wrist as the "
+            f"KR 16 has them (axes {_AXES}, A4, A5 and A6 meeting in a point)"
         )
-        if not alike:
-            raise ValueError(
-                f"{robot.path}: the closed-form inverse needs axes and a spherical wrist as the "
-                f"KR 16 has them (axes {_AXES}, A4, A5 and A6 meeting in a point)"
-            )
-        return cls(
-            height=float(offsets[0, 2]),
-            shoulder=float(offsets[1, 0]),
-            upper_arm=float(offsets[2, 0]),
-            forearm=float(offsets[3, 0]),
-            forearm_rise=float(offsets[3, 2]),
-        )
-
-    def place_wrist(
-        self, centre: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """A1, A2, A3 (rad) for the wrist's centre (..., 3), and whether it is near enough."""
-        x, y, z = np.moveaxis(centre, -1, 0)
-        reach, rise = np.hypot(x, y) - self.shoulder, z - self.height
-        # The triangle shoulder, elbow, wrist: d^2 = u^2 + f^2 + 2 u f cos(bend)
-        forearm = np.hypot(self.forearm, self.forearm_rise)
-        cosine = (reach**2 + rise**2 - self.upper_arm**2 - forearm**2) / (
-            2.0 * self.upper_arm * forearm
-        )
-        bend = np.arccos(np.clip(cosine, -1.0, 1.0))
-        # Angles about y count downwards from x.
-        a3 = bend - np.arctan2(-self.forearm_rise, self.forearm)
-        inner = np.arctan2(forearm * np.sin(bend), self.upper_arm + forearm * np.cos(bend))
-        a2 = _wrapped(np.arctan2(-rise, reach) - inner)
-        return -np.arctan2(y, x), a2, a3, np.abs(cosine) <= 1.0 + _SLACK
+    return _Arm(
+        height=float(offsets[0, 2]),
+        shoulder=float(offsets[1, 0]),
+        upper_arm=float(offsets[2, 0]),
+        forearm=float(offsets[3, 0]),
+        forearm_rise=float(offsets[3, 2]),
+    )
 
 
-def _turn_wrist(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A4, A5, A6 (rad) from R = Rx(-A4) Ry(A5) Rx(-A6), (..., 3, 3), with A5 <= 0.
+@numba.njit(cache=True)
+def _solve(arm: _Arm, frames: np.ndarray, joints: np.ndarray, near_enough: np.ndarray) -> None:
+    """Writes the joints (n, 6) that bring the last link to frames (n, 4, 4).
 
-    Its first column is (cos A5, -sin A5 sin A4, -sin A5 cos A4), its first row
+    `near_enough` (n,) is set where the wrist's centre is.
+    """
+    for row in range(len(frames)):
+        near_enough[row] = _place_wrist(arm, frames[row, :3, 3], joints[row])
+        _turn_wrist(frames[row], joints[row])
+
+
+@numba.njit(cache=True)
+def _place_wrist(arm: _Arm, centre: np.ndarray, joints: np.ndarray) -> bool:
+    """Writes A1, A2, A3 for the wrist's centre (3,); False if it is too far or too near."""
+    reach, rise = math.hypot(centre[0], centre[1]) - arm.shoulder, centre[2] - arm.height
+    # The triangle shoulder, elbow, wrist: d^2 = u^2 + f^2 + 2 u f cos(bend)
+    forearm = math.hypot(arm.forearm, arm.forearm_rise)
+    cosine = (reach**2 + rise**2 - arm.upper_arm**2 - forearm**2) / (2.0 * arm.upper_arm * forearm)
+    bend = math.acos(min(max(cosine, -1.0), 1.0))
+    inner = math.atan2(forearm * math.sin(bend), arm.upper_arm + forearm * math.cos(bend))
+    joints[0] = -math.atan2(centre[1], centre[0])
+    # Angles about y count downwards from x.
+    joints[1] = (math.atan2(-rise, reach) - inner + math.pi) % (2.0 * math.pi) - math.pi
+    joints[2] = bend - math.atan2(-arm.forearm_rise, arm.forearm)
+    return abs(cosine) <= 1.0 + _SLACK
+
+
+@numba.njit(cache=True)
+def _turn_wrist(frame: np.ndarray, joints: np.ndarray) -> None:
+    """Writes A4, A5, A6, with A5 <= 0, for a last link's frame (4, 4), given A1, A2 and A3.
+
+    Seen from the forearm, Rz(-A1) Ry(A2 + A3), the frame is R = Rx(-A4) Ry(A5) Rx(-A6). Its first
+    column is (cos A5, -sin A5 sin A4, -sin A5 cos A4), its first row
     (cos A5, -sin A5 sin A6, sin A5 cos A6).
     """
-    sine = np.hypot(rotation[..., 1, 0], rotation[..., 2, 0])
-    singular = sine < _SINGULAR_SINE
-    a4 = np.where(singular, 0.0, np.arctan2(rotation[..., 1, 0], rotation[..., 2, 0]))
-    a5 = -np.arctan2(sine, rotation[..., 0, 0])
-    a6 = np.where(
-        singular,
-        np.arctan2(rotation[..., 1, 2], rotation[..., 1, 1]),
-        np.arctan2(rotation[..., 0, 1], -rotation[..., 0, 2]),
-    )
-    return a4, a5, a6
-
-
-def _forearm_rotation(a1: np.ndarray, pitch: np.ndarray) -> np.ndarray:
-    """Rz(-a1) Ry(pitch), (..., 3, 3)."""
-    c1, s1, c, s = np.cos(a1), np.sin(a1), np.cos(pitch), np.sin(pitch)
-    rows = [[c1 * c, s1, c1 * s], [-s1 * c, c1, -s1 * s], [-s, np.zeros_like(s), c]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    c1, s1 = math.cos(joints[0]), math.sin(joints[0])
+    c, s = math.cos(joints[1] + joints[2]), math.sin(joints[1] + joints[2])
+    r = np.empty((3, 3))
+    for column in range(3):
+        x, y, z = frame[0, column], frame[1, column], frame[2, column]
+        r[0, column] = c1 * c * x - s1 * c * y - s * z
+        r[1, column] = s1 * x + c1 * y
+        r[2, column] = c1 * s * x - s1 * s * y + c * z
+    sine = math.hypot(r[1, 0], r[2, 0])
+    joints[4] = -math.atan2(sine, r[0, 0])
+    if sine < _SINGULAR_SINE:
+        joints[3], joints[5] = 0.0, math.atan2(r[1, 2], r[1, 1])
+    else:
+        joints[3], joints[5] = math.atan2(r[1, 0], r[2, 0]), math.atan2(r[0, 1], -r[0, 2])
 
 
 def _cross_matrix(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -242,8 +250,3 @@ def _cross_matrix(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     cross = np.zeros((4, 4))
     cross[:3, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
     return cross, cross @ cross
-
-
-def _wrapped(angle: np.ndarray) -> np.ndarray:
-    """The same angle in [-pi, pi)."""
-    return np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi

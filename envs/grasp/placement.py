@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from envs.grasp.blocks import MAX_BAR_SHARE, MIN_BAR_M, SHAPE_CODES, build_block
 from envs.grasp.camera import focal_length_px
 from envs.grasp.settings import GraspSettings
+from envs.grasp.threefry import uniform
 
 Floats = NDArray[np.float64]
+Stream = NDArray[np.uint64]
 
 # Air between the footprints of two blocks, so that touching one is not touching the other.
 BLOCK_CLEARANCE_M = 0.02
@@ -65,10 +67,10 @@ def rules(settings: GraspSettings) -> Rules:
     )
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def place_blocks(
-    rng: np.random.Generator,
     rules: Rules,
+    streams: NDArray[np.uint64],
     yaw_limit_rad: Floats,
     camera_m: Floats,
     camera_rotation: Floats,
@@ -77,12 +79,15 @@ def place_blocks(
     position_m: Floats,
     yaw_rad: Floats,
     target_m: Floats,
-) -> bool:
-    """Places B blocks in each of n scenes, the nearest to the robot first.
+    found: NDArray[np.bool_],
+    begin: int,
+    end: int,
+) -> None:
+    """Places B blocks in the scenes from `begin` to `end` of n, the nearest to the robot first.
 
     Args:
-        rng: the source of randomness.
         rules: what the scenes obey.
+        streams: (n, 2) each scene's source of randomness; see `threefry.uniform`.
         yaw_limit_rad: (n,) narrows the range of the yaw to +- this.
         camera_m: (n, C, 3) the cameras' optical centres.
         camera_rotation: (n, C, 3, 3) the cameras' axes as columns.
@@ -91,20 +96,22 @@ def place_blocks(
         position_m: (n, B, 3).
         yaw_rad: (n, B).
         target_m: (n, 3).
-
-    Returns:
-        False if some scene was not found in `MAX_TRIES` tries.
+        found: (n,) False where no scene was found in `MAX_TRIES` tries.
+        begin: the first row.
+        end: the row after the last.
     """
     count = position_m.shape[1]
     size_m = np.empty((count, 3))
-    for row in range(len(target_m)):
+    for row in range(begin, end):
+        found[row] = False
+        stream = streams[row]
         for _ in range(MAX_TRIES):
-            if not _draw_positions(rng, rules, position_m[row]):
+            if not _draw_positions(stream, rules, position_m[row]):
                 continue
-            _draw_yaws(rng, rules, yaw_limit_rad[row], yaw_rad[row])
+            _draw_yaws(stream, rules, yaw_limit_rad[row], yaw_rad[row])
             for block in range(count):
                 point = _draw_block(
-                    rng, rules, size_m[block], box_center_m[row, block], box_half_m[row, block]
+                    stream, rules, size_m[block], box_center_m[row, block], box_half_m[row, block]
                 )
                 if block == 0:
                     _to_world(
@@ -122,18 +129,17 @@ def place_blocks(
                     camera_rotation[row],
                 )
             ):
+                found[row] = True
                 break
-        else:
-            return False
-    return True
 
 
 @numba.njit(cache=True)
-def _draw_positions(rng: np.random.Generator, rules: Rules, position_m: Floats) -> bool:
+def _draw_positions(stream: Stream, rules: Rules, position_m: Floats) -> bool:
     """Draws where the blocks stand, by rising distance; False if the first is not ahead enough."""
     count = len(position_m)
     for block in range(count):
-        x, y = rng.uniform(rules.x_m[0], rules.x_m[1]), rng.uniform(rules.y_m[0], rules.y_m[1])
+        x = uniform(stream, rules.x_m[0], rules.x_m[1])
+        y = uniform(stream, rules.y_m[0], rules.y_m[1])
         place = block
         while place > 0 and math.hypot(
             position_m[place - 1, 0], position_m[place - 1, 1]
@@ -148,25 +154,26 @@ def _draw_positions(rng: np.random.Generator, rules: Rules, position_m: Floats) 
 
 
 @numba.njit(cache=True)
-def _draw_yaws(rng: np.random.Generator, rules: Rules, limit_rad: float, yaw_rad: Floats) -> None:
+def _draw_yaws(stream: Stream, rules: Rules, limit_rad: float, yaw_rad: Floats) -> None:
     low = min(max(rules.yaw_rad[0], -limit_rad), limit_rad)
     high = min(max(rules.yaw_rad[1], -limit_rad), limit_rad)
     for block in range(len(yaw_rad)):
-        yaw_rad[block] = rng.uniform(low, high)
+        yaw_rad[block] = uniform(stream, low, high)
 
 
 @numba.njit(cache=True)
 def _draw_block(
-    rng: np.random.Generator, rules: Rules, size_m: Floats, center_m: Floats, half_m: Floats
+    stream: Stream, rules: Rules, size_m: Floats, center_m: Floats, half_m: Floats
 ) -> tuple[float, float]:
     """Draws a block's shape and dimensions; returns the grasp point (y, z) on its face."""
-    shape = rules.shapes[rng.integers(0, len(rules.shapes))]
-    size_m[0] = rng.uniform(rules.depth_m[0], rules.depth_m[1])
-    size_m[1] = rng.uniform(rules.size_m[0], rules.size_m[1])
-    size_m[2] = rng.uniform(rules.size_m[0], rules.size_m[1])
-    bar_m = rng.uniform(MIN_BAR_M, max(MIN_BAR_M, MAX_BAR_SHARE * size_m[2]))
+    shape = rules.shapes[int(uniform(stream, 0.0, len(rules.shapes)))]
+    size_m[0] = uniform(stream, rules.depth_m[0], rules.depth_m[1])
+    size_m[1] = uniform(stream, rules.size_m[0], rules.size_m[1])
+    size_m[2] = uniform(stream, rules.size_m[0], rules.size_m[1])
+    bar_m = uniform(stream, MIN_BAR_M, max(MIN_BAR_M, MAX_BAR_SHARE * size_m[2]))
+    leg_share, on_left = uniform(stream, 0.0, 1.0), uniform(stream, 0.0, 1.0) < 0.5
     disc_y, disc_z, centroid_y, centroid_z = build_block(
-        shape, size_m, bar_m, rng.random(), rng.random() < 0.5, center_m, half_m
+        shape, size_m, bar_m, leg_share, on_left, center_m, half_m
     )
     return (centroid_y, centroid_z) if rules.grasp_at_centroid else (disc_y, disc_z)
 
@@ -232,9 +239,14 @@ def _separated(first_m: Floats, second_m: Floats, yaw_rad: float) -> bool:
     """Whether a line along or across `yaw` separates two rectangles (4, 3) seen from above."""
     for angle in (yaw_rad, yaw_rad + math.pi / 2):
         x, y = math.cos(angle), math.sin(angle)
-        first = first_m[:, 0] * x + first_m[:, 1] * y
-        second = second_m[:, 0] * x + second_m[:, 1] * y
-        if first.max() < second.min() or second.max() < first.min():
+        first_low = second_low = math.inf
+        first_high = second_high = -math.inf
+        for corner in range(4):
+            first = first_m[corner, 0] * x + first_m[corner, 1] * y
+            second = second_m[corner, 0] * x + second_m[corner, 1] * y
+            first_low, first_high = min(first_low, first), max(first_high, first)
+            second_low, second_high = min(second_low, second), max(second_high, second)
+        if first_high < second_low or second_high < first_low:
             return True
     return False
 
@@ -262,10 +274,12 @@ def _seen(
                     corner,
                 )
                 for camera in range(len(camera_m)):
-                    # Not a matrix product: numba would want SciPy for it.
-                    ray, axes = corner - camera_m[camera], camera_rotation[camera]
-                    x, y = (ray * axes[:, 0]).sum(), (ray * axes[:, 1]).sum()
-                    depth = (ray * axes[:, 2]).sum()
+                    x, y, depth = 0.0, 0.0, 0.0
+                    for axis in range(3):
+                        ray = corner[axis] - camera_m[camera, axis]
+                        x += ray * camera_rotation[camera, axis, 0]
+                        y += ray * camera_rotation[camera, axis, 1]
+                        depth += ray * camera_rotation[camera, axis, 2]
                     width, rows = rules.image_px[camera]
                     focal = rules.focal_px[camera]
                     if (

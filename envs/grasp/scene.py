@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from envs.grasp.batch import Batch
 from envs.grasp.camera import Views, sample_views
 from envs.grasp.placement import place_blocks, rules
 from envs.grasp.settings import GraspSettings, Randomize
+from envs.grasp.team import Team
 
 Floats = NDArray[np.float64]
 
@@ -65,6 +67,7 @@ class SceneSampler:
     def __init__(self, settings: GraspSettings):
         self._settings = settings
         self._rules = rules(settings)
+        self._team = Team()
 
     def sample(
         self, rng: np.random.Generator, yaw_limit_rad: Floats
@@ -93,9 +96,13 @@ class SceneSampler:
             light_direction=_light_directions(rng, randomize, n),
             light_intensity=rng.uniform(*randomize.light_intensity, n),
         )
-        found = place_blocks(
-            rng,
+        streams = np.zeros((n, 2), np.uint64)
+        streams[:, 0] = rng.integers(2**64, size=n, dtype=np.uint64)
+        found = np.empty(n, bool)
+        place = partial(
+            place_blocks,
             self._rules,
+            streams,
             yaw_limit_rad,
             np.stack([view.position_m for view in views.values()], axis=1),
             np.stack([view.rotation for view in views.values()], axis=1),
@@ -104,8 +111,10 @@ class SceneSampler:
             scenes.block_position_m,
             scenes.block_yaw_rad,
             scenes.target_m,
+            found,
         )
-        if not found:
+        self._team.share(place, n)
+        if not found.all():
             raise SceneError(
                 f"no scene with {blocks} blocks fits: widen environment.randomize.block_x_m and "
                 "block_y_m, lower blocks or target_lead_m, or let the cameras see more (fov_deg, "

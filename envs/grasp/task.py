@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.grasp.batch import Batch
-from envs.grasp.kinematics import inverse, joint_path, motion_duration_s, tooltip_pose
+from envs.grasp.kinematics import InverseKinematics, joint_path, motion_duration_s, tooltip_pose
 from envs.grasp.robot import HOME_JOINTS_RAD, load_robot
 from envs.grasp.scene import Scenes, heading
 from envs.grasp.settings import Goal, Workspace
@@ -20,7 +20,6 @@ from rewards.transition import Transition
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -80,15 +79,16 @@ class Arm:
 
     def __init__(self, workspace: Workspace, motion_checks: int):
         self._robot = load_robot()
+        self._inverse = InverseKinematics(self._robot)
         self._path_poses = motion_checks + 1
         ranges = (workspace.x_m, workspace.y_m, workspace.z_m, np.radians(workspace.yaw_deg))
         self._low, self._high = np.array(ranges, float).T
+        self._home = tooltip_pose(self._robot, np.array(HOME_JOINTS_RAD))
 
     def home(self, n: int) -> Tools:
         """N robots in their home pose."""
-        joints = np.tile(HOME_JOINTS_RAD, (n, 1))
-        frame = tooltip_pose(self._robot, joints)
-        return Tools(joints, frame[:, :3, 3], np.zeros(n), frame[:, :3, 2])
+        tooltip_m, axis = (np.tile(self._home[:3, column], (n, 1)) for column in (3, 2))
+        return Tools(np.tile(HOME_JOINTS_RAD, (n, 1)), tooltip_m, np.zeros(n), axis)
 
     def pose(self, actions: Floats) -> tuple[Floats, Floats]:
         """Tooltip (N, 3) and yaw (N,) that actions (N, 4) in [-1, 1] stand for."""
@@ -108,7 +108,7 @@ class Arm:
             The tools afterwards, the joint path (N, p, 6) that leads there, and its duration (N,).
         """
         tooltip, yaw = self.pose(actions)
-        joints, _ = inverse(self._robot, tooltip, yaw)
+        joints, _ = self._inverse(tooltip, yaw)
         path = joint_path(start.joints_rad, joints, self._path_poses)
         duration_s = motion_duration_s(self._robot, start.joints_rad, joints)
         return Tools(joints, tooltip, yaw, heading(yaw)), path, duration_s
@@ -116,12 +116,10 @@ class Arm:
 
 def block_offset(tooltip_m: Floats, target_m: Floats, target_yaw_rad: Floats) -> Floats:
     """Tooltips (n, 3) in the frames of the target blocks: lateral x, vertical y, gap z."""
-    normal = -heading(target_yaw_rad)
-    lateral = np.cross(UP, normal)
-    difference = tooltip_m - target_m
-    return np.stack(
-        [(difference * lateral).sum(1), difference[:, 2], (difference * normal).sum(1)], axis=1
-    )
+    cosine, sine = np.cos(target_yaw_rad), np.sin(target_yaw_rad)
+    x, y, z = (tooltip_m - target_m).T
+    # The normal is (-cos, -sin, 0), the lateral axis z cross normal: (sin, -cos, 0).
+    return np.stack([x * sine - y * cosine, z, -x * cosine - y * sine], axis=1)
 
 
 def yaw_error(yaw_rad: Floats, target_yaw_rad: Floats) -> Floats:

@@ -10,10 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.grasp.kinematics import (
+    InverseKinematics,
     forward,
     grasp_pose,
-    inverse,
-    inverse_pose,
     joint_path,
     motion_duration_s,
     tooltip_pose,
@@ -24,6 +23,7 @@ from envs.grasp.robot import HOME_JOINTS_RAD, KR16_URDF, load_robot
 LOWER = (0.81, -0.45, 0.6, -40.0)
 UPPER = (1.35, 0.45, 1.0, 40.0)
 ROBOT = load_robot()
+INVERSE = InverseKinematics(ROBOT)
 
 
 def workspace(steps: tuple[int, int, int, int]) -> np.ndarray:
@@ -116,7 +116,7 @@ def test_inverse_reaches_the_pose_in_pybullet(bullet: Bullet) -> None:
     poses = np.concatenate(
         [corners, workspace((5, 5, 5, 5)).reshape(-1, 4), random_workspace(2000)]
     )
-    joints, reachable = inverse(ROBOT, poses[:, :3], poses[:, 3])
+    joints, reachable = INVERSE(poses[:, :3], poses[:, 3])
     assert reachable.all()
     tooltip = bullet.links.index("tooltip")
     tips = np.stack([bullet.frames(pose)[tooltip] for pose in joints])
@@ -128,7 +128,7 @@ def test_inverse_reaches_the_pose_in_pybullet(bullet: Bullet) -> None:
 
 def test_every_pose_of_the_workspace_is_reachable() -> None:
     poses = workspace((28, 31, 17, 33))
-    joints, reachable = inverse(ROBOT, poses[..., :3], poses[..., 3])
+    joints, reachable = INVERSE(poses[..., :3], poses[..., 3])
     assert reachable.all()
     assert (joints >= ROBOT.lower_rad).all()
     assert (joints <= ROBOT.upper_rad).all()
@@ -139,13 +139,13 @@ def test_every_pose_of_the_workspace_is_reachable() -> None:
 def test_no_wrist_flips_between_neighbours() -> None:
     # Steps of 2 cm, 3 cm, 2.5 cm and 2.5 deg: a flip would be a jump of about 180 deg.
     poses = workspace((28, 31, 17, 33))
-    joints, _ = inverse(ROBOT, poses[..., :3], poses[..., 3])
+    joints, _ = INVERSE(poses[..., :3], poses[..., 3])
     for axis in range(4):
         assert np.rad2deg(np.abs(np.diff(joints, axis=axis)).max()) < 20.0
 
 
 def test_straight_ahead_leaves_turning_axes_at_zero() -> None:
-    joints, reachable = inverse(ROBOT, np.array([1.05, 0.0, 0.72]), np.array(0.0))
+    joints, reachable = INVERSE(np.array([1.05, 0.0, 0.72]), np.array(0.0))
     assert reachable
     np.testing.assert_allclose(joints[[0, 3, 5]], 0.0, atol=1e-12)
     assert joints[1:3].sum() > 0  # the forearm slopes down, the elbow is above
@@ -167,7 +167,7 @@ def test_inverse_pose_returns_the_joints_of_its_branch(joints: tuple[float, ...]
     frames = forward(ROBOT, np.array(joints))
     wrist = frames[ROBOT.link_names.index("link_6"), :3, 3]
     facing = wrist[:2] @ [np.cos(-joints[0]), np.sin(-joints[0])]
-    found, reachable = inverse_pose(ROBOT, frames[ROBOT.tooltip_link])
+    found, reachable = INVERSE.of_pose(frames[ROBOT.tooltip_link])
     if facing > 1e-3:
         assert reachable
         np.testing.assert_allclose(found, joints, atol=1e-6)
@@ -175,7 +175,7 @@ def test_inverse_pose_returns_the_joints_of_its_branch(joints: tuple[float, ...]
 
 def test_singular_wrist_turns_a6_alone() -> None:
     joints = np.deg2rad([10, -90, 80, 25, 0, 40])
-    found, reachable = inverse_pose(ROBOT, tooltip_pose(ROBOT, joints))
+    found, reachable = INVERSE.of_pose(tooltip_pose(ROBOT, joints))
     assert reachable
     np.testing.assert_allclose(np.rad2deg(found), [10, -90, 80, 0, 0, 65], atol=1e-6)
 
@@ -187,7 +187,7 @@ def test_singular_wrist_turns_a6_alone() -> None:
 )
 @pytest.mark.filterwarnings("error")
 def test_unreachable_poses_are_flagged_and_finite(tooltip_m: tuple[float, ...]) -> None:
-    joints, reachable = inverse(ROBOT, np.array([tooltip_m]), np.zeros(1))
+    joints, reachable = INVERSE(np.array([tooltip_m]), np.zeros(1))
     assert not reachable.any()
     assert np.isfinite(joints).all()
     assert ((joints >= ROBOT.lower_rad) & (joints <= ROBOT.upper_rad)).all()
@@ -197,12 +197,12 @@ def test_nearest_workspace_is_limited_by_a3() -> None:
     # At 0.75 m straight ahead the arm would have to fold to A3 = 158 deg.
     x = np.array([0.75, 0.80, 0.81])
     tooltip_m = np.stack([x, np.zeros(3), np.full(3, 0.675)], axis=-1)
-    _, reachable = inverse(ROBOT, tooltip_m, np.zeros(3))
+    _, reachable = INVERSE(tooltip_m, np.zeros(3))
     np.testing.assert_array_equal(reachable, [False, False, True])
 
 
 def test_far_pose_stretches_the_arm_towards_it() -> None:
-    joints, _ = inverse(ROBOT, np.array([[2.5, 2.5, 0.675]]), np.deg2rad([45.0]))
+    joints, _ = INVERSE(np.array([[2.5, 2.5, 0.675]]), np.deg2rad([45.0]))
     tip = tooltip_pose(ROBOT, joints)[0, :3, 3]
     assert tip[0] == pytest.approx(tip[1])
     assert np.hypot(*tip[:2]) == pytest.approx(0.26 + 0.68 + np.hypot(0.67, 0.035) + 0.278)
@@ -211,10 +211,10 @@ def test_far_pose_stretches_the_arm_towards_it() -> None:
 
 def test_single_and_batched_calls_agree() -> None:
     poses = random_workspace(12).reshape(3, 4, 4)
-    joints, reachable = inverse(ROBOT, poses[..., :3], poses[..., 3])
+    joints, reachable = INVERSE(poses[..., :3], poses[..., 3])
     assert joints.shape == (3, 4, 6)
     assert reachable.shape == (3, 4)
-    alone, _ = inverse(ROBOT, poses[1, 2, :3], poses[1, 2, 3])
+    alone, _ = INVERSE(poses[1, 2, :3], poses[1, 2, 3])
     np.testing.assert_array_equal(alone, joints[1, 2])
     assert forward(ROBOT, joints).shape == (3, 4, len(ROBOT.link_names), 4, 4)
 
@@ -224,7 +224,7 @@ def test_closed_form_refuses_another_build() -> None:
     origins[ROBOT.link_names.index("link_5"), 0, 3] = 0.05  # the wrist is no longer spherical
     other = dataclasses.replace(ROBOT, link_origins=origins)
     with pytest.raises(ValueError, match="spherical wrist"):
-        inverse(other, np.array([1.0, 0.0, 0.7]), np.array(0.0))
+        InverseKinematics(other)
 
 
 def test_joint_path_is_even_and_ends_exactly() -> None:
@@ -246,6 +246,6 @@ def test_slowest_joint_sets_the_duration() -> None:
 
 def test_way_home_does_not_flip_the_wrist() -> None:
     poses = workspace((5, 7, 5, 7)).reshape(-1, 4)
-    joints, _ = inverse(ROBOT, poses[:, :3], poses[:, 3])
+    joints, _ = INVERSE(poses[:, :3], poses[:, 3])
     sweep = np.rad2deg(np.abs(joints - np.array(HOME_JOINTS_RAD)).max(axis=0))
     assert (sweep < 100.0).all()

@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pybullet
 import pytest
+from worlds import FIRST, fixed_views, home, pose, reaching, sampled
 
 from encoders.spaces import DepthImage
 from envs.grasp.camera import Views, focal_length_px, sample_views, sense_depth
-from envs.grasp.kinematics import inverse
-from envs.grasp.robot import HOME_JOINTS_RAD, load_robot
-from envs.grasp.scene import Scenes, SceneSampler
+from envs.grasp.scene import Scenes
 from envs.grasp.settings import Camera, GraspSettings, Support, Workspace
 from envs.grasp.simulators import pybullet as pybullet_module
 from envs.grasp.simulators.factory import make_simulator
@@ -24,33 +23,9 @@ from envs.grasp.simulators.workers import ParallelSimulator
 from envs.grasp.task import Arm, Tools
 
 ROOT = Path(__file__).parents[2]
-ROBOT = load_robot()
-HOME = np.array(HOME_JOINTS_RAD)
-FIRST = np.array([0])
 SceneBuilder = Callable[..., Scenes]
 # Far from everything the tests do with the target.
 ASIDE = ((1.35, -0.38), 0.0, (0.1, 0.15, 0.15))
-
-
-def home(count: int) -> np.ndarray:
-    return np.tile(HOME, (count, 1))
-
-
-def pose(x: float, y: float, z: float, yaw: float = 0.0) -> np.ndarray:
-    """Joint angles (1, 1, 6): a path of one pose."""
-    joints, reached = inverse(ROBOT, np.array([[x, y, z]]), np.array([yaw]))
-    assert reached.all()
-    return joints[:, None]
-
-
-def fixed_views(camera: Camera, count: int = 1) -> Views:
-    return sample_views(camera, np.random.default_rng(0), count, 0.0, 0.0)
-
-
-def sampled(count: int, seed: int = 0, **cameras: Camera) -> tuple[Scenes, dict[str, Views]]:
-    settings = GraspSettings(cameras=cameras or {"depth": Camera(type="depth")})
-    limits = np.full(count, np.pi)
-    return SceneSampler(settings).sample(np.random.default_rng(seed), limits)
 
 
 @pytest.fixture
@@ -354,22 +329,13 @@ def test_the_robot_stays_where_it_moved(
 # -- many worlds -----------------------------------------------------------------------------------
 
 
-def paths(scenes: Scenes, seed: int) -> np.ndarray:
-    """Joint paths (n, 5, 6) that end near the targets, so that some touch and some collide."""
-    rng = np.random.default_rng(seed)
-    tooltip = scenes.target_m + rng.uniform(-0.06, 0.06, scenes.target_m.shape)
-    joints, _ = inverse(ROBOT, tooltip, scenes.target_yaw_rad)
-    part = np.linspace(0.2, 1.0, 5)[None, :, None]
-    return HOME * (1 - part) + joints[:, None] * part
-
-
 def test_worlds_of_one_client_do_not_see_each_other(
     simulate: Callable[[Scenes], PyBulletSimulator],
 ) -> None:
     count = 18  # worlds share clients, and there are several clients
     scenes, views = sampled(count)
     shared = simulate(scenes)
-    path = paths(scenes, 0)
+    path = reaching(scenes, 0)
     contacts = shared.move(np.arange(count), path)
     images = shared.render(np.arange(count), views["depth"])
     again = shared.render(np.arange(count)[::3], views["depth"][::3])
@@ -389,14 +355,14 @@ def rollout(simulator: PyBulletSimulator, count: int) -> list[np.ndarray]:
     rng, seen, everywhere = np.random.default_rng(0), [], np.arange(count)
     first, _ = sampled(count, 100)
     simulator.load(everywhere, first, home(count))
-    simulator.move(everywhere, paths(first, 5))
+    simulator.move(everywhere, reaching(first, 5))
     views = fixed_views(Camera(type="depth", width=40, height=40), count)
     for step in range(8):
         index = np.flatnonzero(rng.random(count) < 0.6)
         index = index[index % 2 == 1] if step < 6 else index  # every second world waits
         scenes, _ = sampled(len(index), step)
         simulator.load(index, scenes, home(len(index)))
-        contacts = simulator.move(index, paths(scenes, step))
+        contacts = simulator.move(index, reaching(scenes, step))
         seen += [contacts.touched, contacts.collided, simulator.render(everywhere, views)]
     return seen
 

@@ -14,7 +14,7 @@ import pytest
 from encoders.spaces import DepthImage
 from envs.environment import EnvironmentFailure
 from envs.grasp.camera import Views
-from envs.grasp.kinematics import inverse
+from envs.grasp.kinematics import InverseKinematics
 from envs.grasp.robot import HOME_JOINTS_RAD, load_robot
 from envs.grasp.scene import Scenes, SceneSampler
 from envs.grasp.settings import Camera, GraspSettings, Support
@@ -45,7 +45,7 @@ def scenes_and_views() -> tuple[Scenes, dict[str, Views]]:
 def paths(scenes_and_views: tuple[Scenes, dict[str, Views]]) -> np.ndarray:
     scenes, _ = scenes_and_views
     near = scenes.target_m + np.random.default_rng(1).uniform(-0.05, 0.05, (COUNT, 3))
-    joints, _ = inverse(load_robot(), near, scenes.target_yaw_rad)
+    joints, _ = InverseKinematics(load_robot())(near, scenes.target_yaw_rad)
     part = np.linspace(0.25, 1.0, 4)[None, :, None]
     return home(1)[None] * (1 - part) + joints[:, None] * part
 

@@ -6,7 +6,6 @@ for the tessellation of cylinders, which are exact here.
 
 from __future__ import annotations
 
-import os
 from functools import partial
 
 import numpy as np
@@ -26,7 +25,7 @@ from envs.grasp.simulators.kernels.pictures import (
     take_pictures,
 )
 from envs.grasp.simulators.kernels.worlds import RobotArrays, WorldArrays
-from envs.grasp.simulators.team import Team
+from envs.grasp.team import Team
 
 CUP = "cup"
 ORTHONORMAL_TOLERANCE = 1e-6
@@ -50,9 +49,7 @@ class FastSimulator:
     """
 
     def __init__(self, num_worlds: int, support: Support, threads: int | None = None):
-        if threads is not None and threads < 1:
-            raise ValueError(f"{threads} threads: there must be at least 1")
-        self._team = Team(len(os.sched_getaffinity(0)) if threads is None else threads)
+        self._team = Team(threads)
         self._robot = robot_arrays(load_robot())
         self._num_worlds, self._support = num_worlds, support
         self._worlds = _empty_worlds(num_worlds, 1, len(self._robot.axes))

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.grasp.simulators.kernels.worlds import kernel
+from envs.grasp.threefry import threefry
 
 FAST = {"contract", "reassoc", "nsz", "arcp", "afn"}
-PARITY = np.uint32(0x1BD11BDA)
 MANTISSA_BITS = np.int32(23)
 # Of the float32 next to sqrt(1/2): mantissas go from there to sqrt(2).
 HALF_ROOT_BITS = np.int32(0x3F3504F3)
@@ -28,45 +28,6 @@ LOG = tuple(
 )  # fmt: skip
 SINE = tuple(np.float32(value) for value in (1.0, -1 / 6, 1 / 120, -1 / 5040))
 COSINE = tuple(np.float32(value) for value in (1.0, -1 / 2, 1 / 24, -1 / 720, 1 / 40320))
-
-
-@kernel()
-def _mixed(x: np.uint32, y: np.uint32, turn: int) -> tuple[np.uint32, np.uint32]:
-    """One round: add, rotate by `turn` bits, exclusive or."""
-    total = np.uint32(x + y)
-    turned = np.uint32(np.uint32(y << np.uint32(turn)) | np.uint32(y >> np.uint32(32 - turn)))
-    return total, np.uint32(turned ^ total)
-
-
-@kernel()
-def threefry(
-    key: tuple[np.uint32, np.uint32], counter: tuple[np.uint32, np.uint32]
-) -> tuple[np.uint32, np.uint32]:
-    """Two random uint32 from a key and a counter of two uint32 each: Threefry-2x32, 13 rounds.
-
-    Source: Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011,
-    where 13 rounds pass all tests of BigCrush.
-    """
-    first, second = key
-    third = np.uint32(first ^ second ^ PARITY)
-    x, y = np.uint32(counter[0] + first), np.uint32(counter[1] + second)
-    x, y = _mixed(x, y, 13)
-    x, y = _mixed(x, y, 15)
-    x, y = _mixed(x, y, 26)
-    x, y = _mixed(x, y, 6)
-    x, y = np.uint32(x + second), np.uint32(y + third + np.uint32(1))
-    x, y = _mixed(x, y, 17)
-    x, y = _mixed(x, y, 29)
-    x, y = _mixed(x, y, 16)
-    x, y = _mixed(x, y, 24)
-    x, y = np.uint32(x + third), np.uint32(y + first + np.uint32(2))
-    x, y = _mixed(x, y, 13)
-    x, y = _mixed(x, y, 15)
-    x, y = _mixed(x, y, 26)
-    x, y = _mixed(x, y, 6)
-    x, y = np.uint32(x + first), np.uint32(y + second + np.uint32(3))
-    x, y = _mixed(x, y, 17)
-    return x, y
 
 
 @kernel()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -17,11 +18,16 @@ class Team:
     barriers of OpenMP, on machines where others compute as well.
 
     Args:
-        threads: how many, with the caller.
+        threads: how many, with the caller; None: one for each core.
+
+    Raises:
+        ValueError: `threads` is less than one.
     """
 
-    def __init__(self, threads: int):
-        self._threads = threads
+    def __init__(self, threads: int | None = None):
+        if threads is not None and threads < 1:
+            raise ValueError(f"{threads} threads: there must be at least 1")
+        self._threads = threads = threads or len(os.sched_getaffinity(0))
         self._helpers = ThreadPoolExecutor(threads - 1) if threads > 1 else None
 
     def share(self, work: Callable[[int, int], None], rows: int) -> None:
