@@ -81,9 +81,16 @@ class Network(nn.Module):
         self.features_dim = width
 
     def encode_frames(self, frames: Mapping[str, Tensor]) -> Tensor | None:
-        """Features (U, f) of frames; None for a network without cameras."""
+        """What frames alone decide, (U, f); None for a network without cameras.
+
+        Where there are no vectors that is the whole network, so that experience which shares a
+        frame shares all of its cost.
+        """
+        if not self.frame_encoders:
+            return None
         parts = [encoder(frames[name]) for name, encoder in self.frame_encoders.items()]
-        return torch.cat(parts, dim=1) if parts else None
+        features = torch.cat(parts, dim=1)
+        return features if self.vector_encoders else self.trunk(features)
 
     def forward(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
         """Hidden vectors (B, features_dim).
@@ -92,11 +99,13 @@ class Network(nn.Module):
             observations: B observations.
             frame_features: (B, f) what `encode_frames` said of their frames, where it is known.
         """
-        if frame_features is None and self.frame_encoders:
+        if frame_features is None:
             frame_features = self.encode_frames(observations.frames)
             if frame_features is not None and observations.frame_index is not None:
                 frame_features = frame_features[observations.frame_index]
         parts = [] if frame_features is None else [frame_features]
+        if not self.vector_encoders:
+            return parts[0]
         vectors = observations.vectors
         parts += [encoder(vectors[name]) for name, encoder in self.vector_encoders.items()]
         hidden: Tensor = self.trunk(torch.cat(parts, dim=1))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trainers.interaction import Interaction, Step
-from trainers.observations import to_tensors
+from trainers.observations import Observations, to_tensors
 from trainers.policy import ActorCritic, FrameFeatures, to_environment
 from trainers.returns import gae
 from trainers.rollout import FrameStore, Rollout, frame_spaces
@@ -151,7 +151,7 @@ class _Frames:
         self._count = interaction.env.num_envs
         spaces = frame_spaces(self._space)
         self.names = frozenset(spaces)
-        self._store = FrameStore(spaces, steps * self._count)
+        self._store = FrameStore(spaces, steps * self._count, device)
         self._index = np.zeros(self._count, np.int64)
         self._features = FrameFeatures(None, None)
         self.new = np.arange(self._count)
@@ -166,16 +166,16 @@ class _Frames:
         if len(self.new):
             self._index[self.new] = self._store.add(raw, self.new)
             with timed("encode"):
-                self._encode(raw)
+                self._encode()
         return torch.from_numpy(self._index.copy()).to(self._device), self._features
 
     def tensors(self) -> dict[str, Tensor]:
         """All frames by name, (U, H, W, C)."""
-        return self._store.tensors(self._device)
+        return self._store.tensors()
 
-    def _encode(self, raw: Mapping[str, NDArray[Any]]) -> None:
-        frames = {name: raw[name] for name in self.names}
-        fresh = self._policy.encode_frames(to_tensors(frames, self._space, self._device, self.new))
+    def _encode(self) -> None:
+        latest = self._store.tensors(self._store.count - len(self.new))
+        fresh = self._policy.encode_frames(Observations(latest, {}))
         if len(self.new) < self._count:
             rows = torch.from_numpy(self.new).to(self._device)
             fresh = self._features.with_rows(rows, fresh)

@@ -188,7 +188,9 @@ class PPO:
                 "Losses/Value Loss": value_loss,
                 "Policy/Entropy": entropy,
             }
-            means = {name: value.item() for name, value in statistics.items()}
+            # All at once: on an accelerator each look at a number waits for all that is under way.
+            numbers = torch.stack(list(statistics.values())).tolist()
+            means = dict(zip(statistics, numbers, strict=True))
             averager.add(means, len(rows))
             if hyper.target_kl is not None and means["Policy/KL"] > hyper.target_kl:
                 return False
@@ -200,7 +202,7 @@ class PPO:
         norm = nn.utils.clip_grad_norm_(
             self.policy.parameters(), self._hyperparameters.max_gradient_norm
         )
-        if not torch.isfinite(loss) or not torch.isfinite(norm):
+        if not torch.isfinite(loss + norm):
             raise NonFiniteError(
                 f"step {self._interaction.step_count}: the loss is {loss.item()}, its gradient's "
                 f"norm {norm.item()}"

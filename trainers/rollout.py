@@ -16,15 +16,25 @@ from trainers.observations import Observations, is_frame
 
 
 class FrameStore:
-    """Frames in the order they came, each once.
+    """Frames in the order they came, each once, and moved to the device once.
 
-    The memory is reserved for the most there can be; the operating system gives it page by page as
-    frames arrive, so that frames which are shared cost nothing.
+    The memory is reserved for the most there can be; on the CPU the operating system gives it page
+    by page as frames arrive, so that frames which are shared cost nothing.
+
+    Args:
+        spaces: of the frames, by name.
+        capacity: the most frames there can be.
+        device: where they are kept.
     """
 
-    def __init__(self, spaces: Mapping[str, gymnasium.Space[Any]], capacity: int):
-        self._arrays = {
-            name: np.empty((capacity, *(space.shape or ())), space.dtype)
+    def __init__(
+        self,
+        spaces: Mapping[str, gymnasium.Space[Any]],
+        capacity: int,
+        device: torch.device,
+    ):
+        self._tensors = {
+            name: torch.empty((capacity, *(space.shape or ())), dtype=_dtype(space), device=device)
             for name, space in spaces.items()
         }
         self.count = 0
@@ -33,15 +43,14 @@ class FrameStore:
         self, observations: Mapping[str, NDArray[Any]], rows: NDArray[np.int64]
     ) -> NDArray[np.int64]:
         """Keeps some rows of the observations; returns the frames' indices."""
-        new = np.arange(self.count, self.count + len(rows))
-        for name, array in self._arrays.items():
-            array[new] = observations[name][rows]
-        self.count += len(rows)
-        return new
+        first, self.count = self.count, self.count + len(rows)
+        for name, tensor in self._tensors.items():
+            tensor[first : self.count].copy_(torch.from_numpy(observations[name][rows]))
+        return np.arange(first, self.count)
 
-    def tensors(self, device: torch.device) -> dict[str, Tensor]:
-        """All frames by name, (count, H, W, C); on the CPU without a copy."""
-        return {k: torch.from_numpy(a[: self.count]).to(device) for k, a in self._arrays.items()}
+    def tensors(self, first: int = 0) -> dict[str, Tensor]:
+        """All frames from the `first` on by name, (count - first, H, W, C), without a copy."""
+        return {name: tensor[first : self.count] for name, tensor in self._tensors.items()}
 
 
 @dataclass(frozen=True)
@@ -100,3 +109,8 @@ def _take(tensor: Tensor, index: Tensor) -> Tensor:
     if tensor.dtype == torch.uint16:
         return tensor.view(torch.int16)[index].view(torch.uint16)
     return tensor[index]
+
+
+def _dtype(space: gymnasium.Space[Any]) -> torch.dtype:
+    """Torch's name of the type of a space's numbers."""
+    return torch.from_numpy(np.empty(0, space.dtype)).dtype

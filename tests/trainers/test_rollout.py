@@ -41,7 +41,7 @@ def uint16_frames(*values: int) -> torch.Tensor:
 
 def test_the_store_keeps_rows_in_the_order_they_came_and_says_where() -> None:
     spaces = {"depth": DepthImage(SIDE_PX, SIDE_PX), "color": RgbImage(SIDE_PX, SIDE_PX)}
-    store = FrameStore(spaces, capacity=5)
+    store = FrameStore(spaces, capacity=5, device=CPU)
     depth = uint16_frames(10, 40_000, 65_535).numpy()
     color = np.arange(3, dtype=np.uint8)[:, None, None, None] * np.ones((1, 2, 2, 3), np.uint8)
     first = store.add({"depth": depth, "color": color, "joints": np.zeros(3)}, np.arange(3))
@@ -49,24 +49,24 @@ def test_the_store_keeps_rows_in_the_order_they_came_and_says_where() -> None:
     assert first.tolist() == [0, 1, 2]
     assert second.tolist() == [3, 4]
     assert store.count == 5
-    kept = store.tensors(CPU)
+    kept = store.tensors()
     assert kept["depth"].dtype == torch.uint16
     assert kept["depth"].numpy()[:, 0, 0, 0].tolist() == [10, 40_000, 65_535, 65_535, 10]
     assert kept["color"].numpy()[:, 1, 1, 2].tolist() == [0, 1, 2, 2, 0]
 
 
 def test_the_store_is_not_changed_when_the_environment_writes_over_its_images() -> None:
-    store = FrameStore({"depth": DepthImage(SIDE_PX, SIDE_PX)}, capacity=1)
+    store = FrameStore({"depth": DepthImage(SIDE_PX, SIDE_PX)}, capacity=1, device=CPU)
     buffer = uint16_frames(7).numpy()
     store.add({"depth": buffer}, np.array([0]))
     buffer[:] = 9
-    assert store.tensors(CPU)["depth"].numpy().max() == 7
+    assert store.tensors()["depth"].numpy().max() == 7
 
 
 def test_unused_capacity_is_not_handed_out() -> None:
-    store = FrameStore({"depth": DepthImage(SIDE_PX, SIDE_PX)}, capacity=100)
+    store = FrameStore({"depth": DepthImage(SIDE_PX, SIDE_PX)}, capacity=100, device=CPU)
     store.add({"depth": uint16_frames(1, 2).numpy()}, np.array([1]))
-    assert store.tensors(CPU)["depth"].shape == (1, SIDE_PX, SIDE_PX, 1)
+    assert store.tensors()["depth"].shape == (1, SIDE_PX, SIDE_PX, 1)
 
 
 def test_each_transition_gets_its_own_frame_and_each_frame_comes_once() -> None:
@@ -134,8 +134,8 @@ def test_with_a_frame_each_all_splits_are_equally_likely() -> None:
 
 
 def test_vectors_alone_need_no_frames() -> None:
-    store = FrameStore({}, capacity=0)
-    assert store.tensors(CPU) == {}
+    store = FrameStore({}, capacity=0, device=CPU)
+    assert store.tensors() == {}
     observations = rollout_of(torch.arange(3)).observations(torch.tensor([2, 1]))
     assert observations.frames == {}
     assert observations.vectors["number"].flatten().tolist() == [2.0, 1.0]
@@ -143,6 +143,8 @@ def test_vectors_alone_need_no_frames() -> None:
 
 def test_memory_of_shared_frames_is_not_touched() -> None:
     space = Box(0, 255, (64, 64, 3), np.uint8)
-    store = FrameStore({"color": space}, capacity=10**5)  # 1.2 GB if it were all written to
+    store = FrameStore(
+        {"color": space}, capacity=10**5, device=CPU
+    )  # 1.2 GB if it were all written to
     store.add({"color": np.ones((2, 64, 64, 3), np.uint8)}, np.arange(2))
-    assert len(store.tensors(CPU)["color"]) == 2
+    assert len(store.tensors()["color"]) == 2
