@@ -1,5 +1,6 @@
 """The algorithms that ventosa brings along."""
 
+from trainers.ddpg import DDPG
 from trainers.hookspecs import hookimpl
 from trainers.ppo import PPO
 
@@ -7,4 +8,4 @@ from trainers.ppo import PPO
 @hookimpl
 def ventosa_trainers() -> dict[str, type]:
     """Return the built-in algorithms by name."""
-    return {"ppo": PPO}
+    return {"ddpg": DDPG, "ppo": PPO}
