@@ -29,13 +29,6 @@ class DeterministicSettings(ActorCriticSettings, frozen=True, extra="forbid"):
         "then learn from the critic's loss alone.",
     )
 
-    @model_validator(mode="before")
-    @classmethod
-    def _has_no_memory(cls, data: Any) -> Any:
-        if isinstance(data, dict) and data.get("memory") is not None:
-            raise ValueError("DDPG's networks have no memory: leave `memory` out")
-        return data
-
     @model_validator(mode="after")
     def _critic_can_see(self) -> DeterministicSettings:
         if self.critic == "shared" and self.critic_observations is not None:
