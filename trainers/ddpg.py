@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, model_validator
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from trainers.algorithm import TrainerSettings
@@ -43,6 +43,9 @@ class DDPGHyperparameters(BaseModel, frozen=True, extra="forbid"):
         gt=0.0,
         description="Updates per transition; with many environments a fraction of 1 is enough.",
     )
+    policy_delay: int = Field(
+        1, ge=1, description="Updates of the critic for each one of the actor and of the targets."
+    )
     learning_rate: float = Field(1e-3, gt=0.0, description="Of the actor, to begin with.")
     critic_learning_rate: float | None = Field(
         None, gt=0.0, description="Of the critic, to begin with; null: the actor's."
@@ -55,6 +58,9 @@ class DDPGHyperparameters(BaseModel, frozen=True, extra="forbid"):
     n_step: int = Field(1, ge=1, description="Rewards in a return before the critic takes over.")
     noise: NoiseSettings = Field(
         default_factory=GaussianSettings, description="What is added to the actor's actions."
+    )
+    random_actions: float = Field(
+        0.0, ge=0.0, le=1.0, description="Share of the actions that are drawn uniformly instead."
     )
     random_shift_px: int = Field(
         0, ge=0, description="Images are shifted by up to so many pixels at random; 0: never."
@@ -127,6 +133,7 @@ class DDPG:
         online = self.policy.online
         self._actor_parameters = online.actor_parameters()
         self._critic_parameters = online.critic_parameters()
+        self._seen = {*online.actor_sees, *online.critic_sees}
         self._actor_optimizer = torch.optim.Adam(self._actor_parameters, fused=True)
         self._critic_optimizer = torch.optim.Adam(self._critic_parameters, fused=True)
         self._max_gradient_norm = hyper.max_gradient_norm or float("inf")
@@ -140,13 +147,13 @@ class DDPG:
         )
         # Without a future there is no value to estimate, nor anything to look at.
         self._targets = self._bootstrapped_returns if hyper.gamma else self._buffer.rewards
-        self._due = 0.0  # updates that the transitions so far ask for and that were not made
+        self._due = 0.0  # updates that were asked for by transitions, and not made yet
         self._moments: list[_Moment] = []
 
     @torch.no_grad()
     def act(self, observations: Observations, *, deterministic: bool) -> Tensor:
         """See `Algorithm.act`; what is drawn has the noise of the run's end."""
-        actions = self.policy.online.actions(observations)
+        actions = self.policy.online.act(observations)
         if not deterministic:
             sigma = self._sigma(1.0) * self._hyperparameters.noise.deviation()
             noise = torch.randn(actions.shape, generator=self._generator, device=actions.device)
@@ -170,8 +177,8 @@ class DDPG:
         averager = Averager()
         if len(self._buffer) >= self._hyperparameters.buffer_init_steps:
             self._due += len(moments) * self._shape[0] * self._hyperparameters.updates_per_step
-        while self._due >= 1.0:
-            self._due -= 1.0
+        while self._due >= self._hyperparameters.policy_delay:
+            self._due -= self._hyperparameters.policy_delay
             averager.add(self._learn())
         return averager.take() | schedules
 
@@ -213,14 +220,18 @@ class DDPG:
 
     def _explore(self, raw: Mapping[str, NDArray[Any]]) -> Tensor:
         """Actions (N, A) in [-1, 1]."""
-        step = self._interaction.step_count
-        if step < self._hyperparameters.buffer_init_steps:
-            uniform = torch.rand(self._shape, generator=self._generator, device=self._device)
-            return 2.0 * uniform - 1.0
+        step, hyper = self._interaction.step_count, self._hyperparameters
+        uniform = 2.0 * self._rand(self._shape) - 1.0
+        if step < hyper.buffer_init_steps:
+            return uniform
         space = self._interaction.env.single_observation_space
-        actions = self.policy.online.actions(to_tensors(raw, space, self._device))
+        actions = self.policy.online.act(to_tensors(raw, space, self._device))
         sigma = self._sigma(step / self._settings.max_steps)
-        return (actions + sigma * self._noise.sample(self._generator)).clamp(-1.0, 1.0)
+        noisy = (actions + sigma * self._noise.sample(self._generator)).clamp(-1.0, 1.0)
+        return torch.where(self._rand((len(noisy), 1)) < hyper.random_actions, uniform, noisy)
+
+    def _rand(self, shape: tuple[int, int]) -> Tensor:
+        return torch.rand(shape, generator=self._generator, device=self._device)
 
     def _sigma(self, progress: float) -> float:
         noise = self._hyperparameters.noise
@@ -251,39 +262,43 @@ class DDPG:
         self.policy.update_statistics({k: torch.cat([v[k] for v in vectors]) for k in vectors[0]})
 
     def _learn(self) -> dict[str, float]:
-        """One update of the critic, the actor and the targets (Lillicrap et al., algorithm 1)."""
-        online, step = self.policy.online, self._interaction.step_count
-        places = self._buffer.sample(self._hyperparameters.batch_size, self._generator)
-        targets = self._targets(places)
-        features = online.encode(self._augment(self._buffer.observations(places)))
-        # The critic's loss: the mean of (Q(s, a) - y)^2.
-        values = online.value(features.critic, self._buffer.actions(places))
-        value_loss = F.mse_loss(values, targets)
-        descend(
-            self._critic_optimizer,
-            value_loss,
-            self._critic_parameters,
-            self._max_gradient_norm,
-            step,
-        )
-        # The actor's: the mean of -Q(s, mu(s)), under the critic as it is by now.
-        policy_loss = -online.value(features.critic.detach(), online.act(features.actor)).mean()
-        descend(
-            self._actor_optimizer,
-            policy_loss,
-            self._actor_parameters,
-            self._max_gradient_norm,
-            step,
-        )
+        """One round of updates (Lillicrap et al. 2015, algorithm 1)."""
+        for _ in range(self._hyperparameters.policy_delay):
+            places = self._buffer.sample(self._hyperparameters.batch_size, self._generator)
+            value_loss, value = self._improve_critic(places)
+        policy_loss = self._improve_actor(places)
         self.policy.follow()
-        numbers = torch.stack([value_loss.detach(), policy_loss.detach(), values.detach().mean()])
+        numbers = torch.stack([value_loss, policy_loss, value]).tolist()
         names = ("Losses/Value Loss", "Losses/Policy Loss", "Policy/Q Value")
-        return dict(zip(names, numbers.tolist(), strict=True))
+        return dict(zip(names, numbers, strict=True))
+
+    def _improve_critic(self, places: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
+        """Descends the mean of (Q(s, a) - y)^2; returns it, and the mean of Q(s, a)."""
+        online = self.policy.online
+        targets = self._targets(places)
+        observations = self._augment(self._buffer.observations(places, online.critic_sees))
+        values = online.value(observations, self._buffer.actions(places))
+        loss = F.mse_loss(values, targets)
+        self._descend(self._critic_optimizer, loss, self._critic_parameters)
+        return loss.detach(), values.detach().mean()
+
+    def _improve_actor(self, places: NDArray[np.int64]) -> Tensor:
+        """Descends the mean of -Q(s, mu(s)); returns it."""
+        online = self.policy.online
+        observations = self._augment(self._buffer.observations(places, self._seen))
+        loss = -online.value(observations, online.act(observations)).mean()
+        self._descend(self._actor_optimizer, loss, self._actor_parameters)
+        return loss.detach()
 
     @torch.no_grad()
     def _bootstrapped_returns(self, places: NDArray[np.int64]) -> Tensor:
         """Targets y = R + gamma^k Q'(s', mu'(s')), (B,); R is the return of k steps up to s'."""
         hyper, target = self._hyperparameters, self.policy.target
         returns, discounts, last = self._buffer.returns(places, hyper.gamma, hyper.n_step)
-        features = target.encode(self._augment(self._buffer.next_observations(last)))
-        return returns + discounts * target.value(features.critic, target.act(features.actor))
+        following = self._augment(self._buffer.next_observations(last, self._seen))
+        return returns + discounts * target.value(following, target.act(following))
+
+    def _descend(
+        self, optimizer: torch.optim.Optimizer, loss: Tensor, parameters: list[nn.Parameter]
+    ) -> None:
+        descend(optimizer, loss, parameters, self._max_gradient_norm, self._interaction.step_count)

@@ -32,7 +32,7 @@ def descend(
     optimizer.zero_grad(set_to_none=True)
     loss.backward(inputs=parameters)
     norm = nn.utils.clip_grad_norm_(parameters, max_gradient_norm)
-    if not torch.isfinite(loss) or not torch.isfinite(norm):
+    if not torch.isfinite(loss + norm):
         raise NonFiniteError(
             f"step {step}: the loss is {loss.item()}, its gradient's norm {norm.item()}"
         )

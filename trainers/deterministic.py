@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from trainers.errors import UserError
-from trainers.networks import NetworkFactory, NetworkSettings, head, hidden_layers
+from trainers.networks import Network, NetworkFactory, NetworkSettings, head, hidden_layers
 from trainers.observations import Observations
 from trainers.policy import ACTOR_GAIN, CRITIC_GAIN, ActorCriticSettings, observed
 
@@ -36,13 +36,6 @@ class DeterministicSettings(ActorCriticSettings, frozen=True, extra="forbid"):
         return self
 
 
-class Features(NamedTuple):
-    """What the encoders say of B observations: (B, f) for each of the two."""
-
-    actor: Tensor
-    critic: Tensor
-
-
 class DeterministicActorCritic(nn.Module):
     """Encoders, the actor mu(s) and the critic Q(s, a). Actions are scaled to [-1, 1].
 
@@ -50,44 +43,42 @@ class DeterministicActorCritic(nn.Module):
         factory: builds the encoders.
         settings: what the networks look like.
 
+    Attributes:
+        actor_sees: names of the observations.
+        critic_sees: the same.
+
     Raises:
         UserError: the settings don't fit the environment.
     """
 
     def __init__(self, factory: NetworkFactory, settings: DeterministicSettings):
         super().__init__()
-        actor, critic = observed(factory, settings)
+        self.actor_sees, self.critic_sees = observed(factory, settings)
         encoders_alone = settings.model_copy(update=ENCODERS_ALONE)
-        self.critic_encoder = factory.network(encoders_alone, critic)
-        self.actor_encoder = (
-            factory.network(encoders_alone, actor) if settings.critic == "separate" else None
-        )
+        self.critic_encoder = factory.network(encoders_alone, self.critic_sees)
+        self.actor_encoder: Network | None = None
+        if settings.critic == "separate":
+            self.actor_encoder = factory.network(encoders_alone, self.actor_sees)
         size = bounded(factory.action_space).shape[0]
         actor_inputs = (self.actor_encoder or self.critic_encoder).features_dim
         self.actor = nn.Sequential(*_layers(actor_inputs, size, ACTOR_GAIN, settings), nn.Tanh())
         critic_inputs = self.critic_encoder.features_dim + size
         self.critic = nn.Sequential(*_layers(critic_inputs, 1, CRITIC_GAIN, settings))
 
-    def encode(self, observations: Observations) -> Features:
-        """What the encoders say, for the actor and for the critic."""
-        features: Tensor = self.critic_encoder(observations)
-        if self.actor_encoder is None:
-            return Features(features.detach(), features)
-        return Features(self.actor_encoder(observations), features)
-
-    def act(self, features: Tensor) -> Tensor:
+    def act(self, observations: Observations) -> Tensor:
         """mu(s): actions (B, A) in [-1, 1]."""
+        if self.actor_encoder is None:
+            features = self.critic_encoder(observations).detach()
+        else:
+            features = self.actor_encoder(observations)
         actions: Tensor = self.actor(features)
         return actions
 
-    def value(self, features: Tensor, actions: Tensor) -> Tensor:
+    def value(self, observations: Observations, actions: Tensor) -> Tensor:
         """Q(s, a), (B,)."""
+        features = self.critic_encoder(observations)
         values: Tensor = self.critic(torch.cat((features, actions), dim=1))
         return values.squeeze(1)
-
-    def actions(self, observations: Observations) -> Tensor:
-        """mu(s) of raw observations, (B, A) in [-1, 1]; the critic is not asked."""
-        return self.act((self.actor_encoder or self.critic_encoder)(observations))
 
     def actor_parameters(self) -> list[nn.Parameter]:
         """What the policy's loss moves."""

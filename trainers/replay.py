@@ -9,7 +9,7 @@ to it is overwritten.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import gymnasium
@@ -120,10 +120,10 @@ class ReplayBuffer:
         places: NDArray[np.int64] = (oldest + drawn.numpy()) % len(self._rewards)
         return places
 
-    def observations(self, places: NDArray[np.int64]) -> Observations:
-        """What was seen before the transitions."""
-        vectors = {name: values[places] for name, values in self._vectors.items()}
-        return self._tensors(vectors, self._frame[places])
+    def observations(self, places: NDArray[np.int64], names: Collection[str]) -> Observations:
+        """What was seen before the transitions, as far as it is asked for by name."""
+        vectors = {k: values[places] for k, values in self._vectors.items() if k in names}
+        return self._tensors(vectors, self._frame[places], names)
 
     def actions(self, places: NDArray[np.int64]) -> Tensor:
         """What was done, (B, A)."""
@@ -162,21 +162,21 @@ class ReplayBuffer:
         discount[self._terminated[last]] = 0.0
         return self._to_device(total), self._to_device(discount), last
 
-    def next_observations(self, places: NDArray[np.int64]) -> Observations:
+    def next_observations(self, places: NDArray[np.int64], names: Collection[str]) -> Observations:
         """What was seen after the transitions: where an episode was cut off, its last observation.
 
         Where it terminated, there is nothing to see that has a value; it is some observation.
         """
         following = self._after(places)
-        vectors = {name: values[following] for name, values in self._vectors.items()}
+        vectors = {k: values[following] for k, values in self._vectors.items() if k in names}
         frame, final = self._frame[following], self._final[places]
         cut = np.flatnonzero(final != NONE)
         if len(cut):
-            kept = self._finals.take(final[cut])
-            frame[cut] = kept.pop(_FRAME)
-            for name, values in kept.items():
-                vectors[name][cut] = values
-        return self._tensors(vectors, frame)
+            kept = self._finals.take(final[cut], (_FRAME, *vectors))
+            frame[cut] = kept[_FRAME]
+            for name, values in vectors.items():
+                values[cut] = kept[name]
+        return self._tensors(vectors, frame, names)
 
     def state_dict(self) -> dict[str, Any]:
         """All experience, without a copy: it holds until the next `add`."""
@@ -256,20 +256,24 @@ class ReplayBuffer:
         frame, final = self._frame[places], self._final[places]
         cut = np.flatnonzero(final != NONE)
         if len(cut):
-            kept = self._finals.take(final[cut])[_FRAME]
+            kept = self._finals.take(final[cut], (_FRAME,))[_FRAME]
             self._frames.release(kept[kept != frame[cut]])
             self._finals.release(final[cut])
         following = self._frame[self._places(places.start // self._num_envs + 1)]
         self._frames.release(frame[frame != following])
 
     def _tensors(
-        self, vectors: Mapping[str, NDArray[Any]], frame: NDArray[np.int64]
+        self,
+        vectors: Mapping[str, NDArray[Any]],
+        frame: NDArray[np.int64],
+        names: Collection[str],
     ) -> Observations:
         tensors = {name: self._to_device(values) for name, values in vectors.items()}
-        if not self._frames.names:
+        images = self._frames.names.intersection(names)
+        if not images:
             return Observations({}, tensors)
         slots, index = np.unique(frame, return_inverse=True)
-        frames = {name: self._to_device(v) for name, v in self._frames.take(slots).items()}
+        frames = {k: self._to_device(v) for k, v in self._frames.take(slots, images).items()}
         return Observations(frames, tensors, self._to_device(index))
 
     def _to_device(self, array: NDArray[Any]) -> Tensor:
@@ -301,9 +305,9 @@ class _Slots:
         self._touched = max(self._touched, len(self._free) - self._left)
         return slots
 
-    def take(self, slots: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-        """Copies of some entries."""
-        return {name: array[slots] for name, array in self._arrays.items()}
+    def take(self, slots: NDArray[np.int64], names: Collection[str]) -> dict[str, NDArray[Any]]:
+        """Copies of some entries, as far as they are asked for by name."""
+        return {name: self._arrays[name][slots] for name in names}
 
     def release(self, slots: NDArray[np.int64]) -> None:
         """Gives slots back."""

@@ -29,6 +29,7 @@ SPACE = gymnasium.spaces.Dict(
         "height": DepthImage(1, 1),
     }
 )
+NAMES = tuple(SPACE.spaces)
 EVENTS = ("moves", "still", "terminated", "truncated", "truncated still", "both", "static")
 
 
@@ -149,10 +150,11 @@ def check(buffer: ReplayBuffer, world: World, gamma: float, steps: int) -> None:
     places = places_of(buffer)
     actions = buffer.actions(places)[:, 0].tolist()
     assert sorted(actions) == sorted(expected)
-    before, after = as_seen(buffer.observations(places)), as_seen(buffer.next_observations(places))
+    before = as_seen(buffer.observations(places, NAMES))
+    after = as_seen(buffer.next_observations(places, NAMES))
     rewards = buffer.rewards(places).tolist()
     totals, discounts, last = buffer.returns(places, gamma, steps)
-    led_to = as_seen(buffer.next_observations(last))
+    led_to = as_seen(buffer.next_observations(last, NAMES))
     for i, action in enumerate(actions):
         history, number = expected[action]
         one = history[number]
@@ -193,6 +195,17 @@ def test_what_is_drawn_is_what_went_in(
         check(buffer, world, gamma, n)
 
 
+def test_only_what_is_asked_for_is_fetched() -> None:
+    world, buffer = World(1, 4), ReplayBuffer(SPACE, 1, 1, 4, CPU)
+    for event in ("moves", "truncated"):
+        world.step(buffer, [event])
+    for fetch in (buffer.observations, buffer.next_observations):
+        part = fetch(np.array([1]), ["state"])
+        assert (set(part.vectors), part.frames, part.frame_index) == ({"state"}, {}, None)
+        part = fetch(np.array([1]), ["height"])
+        assert (part.vectors, set(part.frames)) == ({}, {"height"})
+
+
 def test_transitions_are_drawn_alike_wherever_they_lie_in_the_ring() -> None:
     world, buffer = World(2, 3), ReplayBuffer(SPACE, 1, 2, 6, CPU)
     for _ in range(8):
@@ -230,7 +243,7 @@ def line_of(
 def estimates(buffer: ReplayBuffer, steps: int) -> list[tuple[float, float, float]]:
     """Return, discount and where the return leads to, of every transition, with gamma 0.5."""
     returns, discounts, last = buffer.returns(np.arange(len(buffer)), 0.5, steps)
-    x = buffer.next_observations(last).vectors["x"][:, 0]
+    x = buffer.next_observations(last, ["x"]).vectors["x"][:, 0]
     return list(zip(returns.tolist(), discounts.tolist(), x.tolist(), strict=True))
 
 
@@ -265,7 +278,7 @@ def test_environments_do_not_see_each_others_rewards() -> None:
         buffer.add({"x": x}, np.zeros((2, 1), np.float32), step, {"x": x + 1})
     returns, _, last = buffer.returns(np.arange(2), 1.0, 3)
     assert returns.tolist() == [3.0, 300.0]
-    assert buffer.next_observations(last).vectors["x"][:, 0].tolist() == [3.0, 13.0]
+    assert buffer.next_observations(last, ["x"]).vectors["x"][:, 0].tolist() == [3.0, 13.0]
 
 
 # -- memory, types, mistakes ---------------------------------------------------------------------
@@ -308,7 +321,7 @@ def test_vectors_keep_their_type_and_images_are_not_looked_for() -> None:
         Step(np.zeros(1), nothing, nothing, nothing, None),
         {"x": x},
     )
-    observations = buffer.observations(np.array([0, 0]))
+    observations = buffer.observations(np.array([0, 0]), ["x"])
     assert observations.vectors["x"].dtype == torch.float64
     assert observations.frames == {}
     assert observations.frame_index is None
@@ -326,7 +339,7 @@ def test_what_was_added_is_not_changed_when_the_environment_writes_over_it() -> 
     )
     for array in shown.values():
         array[:] = 0
-    assert as_seen(buffer.observations(np.array([0]))) == [Seen(1, 2)]
+    assert as_seen(buffer.observations(np.array([0]), NAMES)) == [Seen(1, 2)]
 
 
 def test_a_state_is_no_copy() -> None:
