@@ -21,23 +21,24 @@ def conjugate_gradient(
         matvec: The product A v of a symmetric positive definite (n, n) matrix with a vector (n,).
         b: The right-hand side, (n,).
         max_iterations: The most products to spend.
-        tolerance: It stops once ||b - A x|| <= tolerance * ||b||.
+        tolerance: It stops once ||b - A x|| <= tolerance * ||b||; at the precision of the numbers
+            in any case.
 
     Returns:
-        x, (n,); 0 where b is. Not finite where a product is not.
+        x, (n,); 0 where b is 0, or too small to be squared. Not finite where a product is not.
     """
     x = torch.zeros_like(b)
     residual, direction = b.clone(), b.clone()
     square = residual.dot(residual)
-    enough = tolerance**2 * square
+    # The updated residual goes on falling where rounding keeps x from getting better, and in the end
+    # its square underflows.
+    number = torch.finfo(b.dtype)
+    enough = max(tolerance, number.eps) ** 2 * square + number.tiny
     for _ in range(max_iterations):
         if square <= enough:
             break
         product = matvec(direction)
-        curvature = direction.dot(product)
-        if curvature <= 0:  # of a positive definite matrix only where rounding has left nothing
-            break
-        step = square / curvature
+        step = square / direction.dot(product)
         x += step * direction
         residual -= step * product
         previous, square = square, residual.dot(residual)
