@@ -30,7 +30,7 @@ def conjugate_gradient(
     x = torch.zeros_like(b)
     residual, direction = b.clone(), b.clone()
     square = residual.dot(residual)
-    # The updated residual goes on falling where rounding keeps x from getting better, and in the end
+    # The updated residual goes on falling where rounding keeps x from getting better, and at last
     # its square underflows.
     number = torch.finfo(b.dtype)
     enough = max(tolerance, number.eps) ** 2 * square + number.tiny
