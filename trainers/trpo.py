@@ -135,14 +135,15 @@ class TRPO(OnPolicyAlgorithm):
         def gain_of(distribution: Distribution) -> Tensor:
             return surrogate_gain(distribution, rollout.actions, rollout.log_probs, advantages)
 
-        def measure() -> tuple[Tensor, Tensor]:
-            distribution = self.policy.distribution(observations)
-            return gain_of(distribution), old.kl(distribution).mean()
-
         distribution = self.policy.distribution(observations)
         gain, old = gain_of(distribution), distribution.detach()
         gradient = flat_gradient(gain, self._theta)
         self._check_finite(-gain, gradient.norm())
+
+        def measure() -> tuple[Tensor, Tensor]:
+            new = self.policy.distribution(observations)
+            return gain_of(new), old.kl(new).mean()
+
         step = self._step(rollout, gradient, delta)
         search = line_search(
             measure,
