@@ -2,9 +2,10 @@
 
 from trainers.hookspecs import hookimpl
 from trainers.ppo import PPO
+from trainers.trpo import TRPO
 
 
 @hookimpl
 def ventosa_trainers() -> dict[str, type]:
     """Return the built-in algorithms by name."""
-    return {"ppo": PPO}
+    return {"ppo": PPO, "trpo": TRPO}
