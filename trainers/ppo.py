@@ -18,6 +18,7 @@ from trainers.observations import Observations
 from trainers.on_policy import OnPolicyCollector
 from trainers.policy import ActorCritic, PolicySettings
 from trainers.returns import explained_variance, normalize
+from trainers.reward_normalizer import RewardNormalizer
 from trainers.rollout import Rollout
 from trainers.schedules import Schedule
 
@@ -38,6 +39,9 @@ class PPOHyperparameters(BaseModel, frozen=True, extra="forbid"):
     learning_rate_schedule: Schedule = Field(LINEAR, description="Course of both learning rates.")
     gamma: float = Field(0.99, ge=0.0, le=1.0, description="Discount factor.")
     lambd: float = Field(0.95, ge=0.0, le=1.0, description="Lambda of the advantage estimate.")
+    normalize_rewards: bool = Field(
+        False, description="Scale rewards by the standard deviation of the discounted returns."
+    )
     epsilon: float = Field(0.2, gt=0.0, description="How far the probability ratio may move.")
     epsilon_schedule: Schedule = Field(CONSTANT, description="Course of epsilon.")
     beta: float = Field(5e-3, ge=0.0, description="Weight of the entropy bonus.")
@@ -98,8 +102,12 @@ class PPO:
             eps=1e-5,
             fused=True,
         )
-        steps = -(-hyper.buffer_size // interaction.env.num_envs)
-        self._collector = OnPolicyCollector(self.policy, interaction, steps, generator, device)
+        count = interaction.env.num_envs
+        steps = -(-hyper.buffer_size // count)
+        normalizer = RewardNormalizer(count, hyper.gamma) if hyper.normalize_rewards else None
+        self._collector = OnPolicyCollector(
+            self.policy, interaction, steps, generator, device, normalizer
+        )
         self._interaction = interaction
         self._rollout: Rollout | None = None
 
@@ -131,12 +139,17 @@ class PPO:
 
     def state_dict(self) -> dict[str, Any]:
         """See `Algorithm.state_dict`."""
-        return {"optimizer": self._optimizer.state_dict(), "generator": self._generator.get_state()}
+        return {
+            "optimizer": self._optimizer.state_dict(),
+            "collector": self._collector.state_dict(),
+            "generator": self._generator.get_state(),
+        }
 
     def load_state_dict(self, weights: dict[str, Tensor], state: dict[str, Any]) -> None:
         """See `Algorithm.load_state_dict`."""
         self.policy.load_state_dict(weights)
         self._optimizer.load_state_dict(state["optimizer"])
+        self._collector.load_state_dict(state["collector"])
         self._generator.set_state(state["generator"])
 
     def _set_schedules(self, progress: float) -> dict[str, float]:
