@@ -49,9 +49,9 @@ class RewardNormalizer:
         sums = rewards.to("cpu", torch.float64, copy=True).numpy()
         discounts = np.where(done.cpu().numpy(), 0.0, self._gamma)
         carried = self._carried
-        for step, discount in zip(sums, discounts, strict=True):
-            step += carried
-            carried = discount * step
+        for row, discount in enumerate(discounts):
+            sums[row] += carried
+            carried = discount * sums[row]
         self._carried = carried
         self._returns.update(torch.from_numpy(sums).reshape(-1, 1))
         return (rewards / self.deviation).clamp(-CLIP, CLIP)

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 def episode_seed(run_seed: int, index: int, episode: int) -> int:
     """The seed, from 0 to 2^31 - 1, of an episode (from 0) of one of a run's environments."""
-    word = np.random.SeedSequence((run_seed, index, episode)).generate_state(1)[0]
+    # As a spawn key, because entropy of different lengths may be the same: (1, 0) is (1,).
+    word = np.random.SeedSequence(run_seed, spawn_key=(index, episode)).generate_state(1)[0]
     return int(word >> 1)  # some environments pass it to generators that take 31 bits
 
 

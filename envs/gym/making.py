@@ -43,7 +43,9 @@ def make(settings: GymSettings) -> gymnasium.Env[Any, Any]:
             name, max_episode_steps=settings.max_episode_steps, **settings.kwargs
         )
     except (gymnasium.error.UnregisteredEnv, gymnasium.error.DeprecatedEnv) as error:
-        raise ValueError(f"id: gymnasium knows no environment {name!r}; {_nearest(name)}") from error
+        raise ValueError(
+            f"id: gymnasium knows no environment {name!r}; {_nearest(name)}"
+        ) from error
     except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
         raise ValueError(f"id: {name!r} lacks a package: {error}{_remedy(name)}") from error
     except Exception as error:  # an environment is foreign code: it can refuse in any way

@@ -145,7 +145,7 @@ class GymEnvironment(Environment):
 
     def _final(self, last: NDArray[Any], done: NDArray[np.bool_]) -> Observations:
         """Observations (N, ...), right where episodes ended, from an array (N,) of objects."""
-        ended = self._observe(self._stacked(last[done]))
+        ended = self._observe(self._stacked(list(last[done])))
         final = {
             name: np.zeros((self.num_envs, *values.shape[1:]), values.dtype)
             for name, values in ended.items()
@@ -157,7 +157,8 @@ class GymEnvironment(Environment):
     def _stacked(self, observations: Sequence[Any]) -> Any:
         """Observations of k environments as gymnasium batches them."""
         space = self._vector.single_observation_space
-        return concatenate(space, observations, create_empty_array(space, len(observations)))
+        out: Any = create_empty_array(space, len(observations))
+        return concatenate(space, observations, out)
 
     def _call(self, method: str, *arguments: Any) -> Any:
         return self._guarded(self._vector.call, method, *arguments)
@@ -166,6 +167,10 @@ class GymEnvironment(Environment):
         """Calls into the environments, which may fail in any way."""
         try:
             return function(*arguments)
+        except (EOFError, ConnectionError) as error:
+            raise EnvironmentFailure(
+                f"the environment {self._id!r} failed: one of its processes died"
+            ) from error
         except Exception as error:
             reason = f"{type(error).__name__}: {error}".removesuffix(": ")
             raise EnvironmentFailure(f"the environment {self._id!r} failed: {reason}") from error
