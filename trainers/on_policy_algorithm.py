@@ -9,7 +9,8 @@ import torch
 from pydantic import BaseModel, Field, model_validator
 from torch import Tensor, nn
 
-from trainers.interaction import Interaction, NonFiniteError
+from trainers.descent import descend
+from trainers.interaction import Interaction
 from trainers.observations import Observations
 from trainers.on_policy import OnPolicyCollector
 from trainers.policy import ActorCritic
@@ -119,16 +120,6 @@ class OnPolicyAlgorithm:
         Raises:
             NonFiniteError: the loss or its gradient is NaN or infinite; nothing was changed.
         """
-        self._optimizer.zero_grad(set_to_none=True)
-        loss.backward()
         parameters = [p for group in self._optimizer.param_groups for p in group["params"]]
-        norm = nn.utils.clip_grad_norm_(parameters, self._max_gradient_norm)
-        self._check_finite(loss, norm)
-        self._optimizer.step()
-
-    def _check_finite(self, loss: Tensor, gradient_norm: Tensor) -> None:
-        if not torch.isfinite(loss + gradient_norm):
-            raise NonFiniteError(
-                f"step {self._interaction.step_count}: the loss is {loss.item()}, its gradient's "
-                f"norm {gradient_norm.item()}"
-            )
+        step = self._interaction.step_count
+        descend(self._optimizer, loss, parameters, self._max_gradient_norm, step)

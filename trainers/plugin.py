@@ -1,5 +1,6 @@
 """The algorithms that ventosa brings along."""
 
+from trainers.ddpg import DDPG
 from trainers.hookspecs import hookimpl
 from trainers.ppo import PPO
 from trainers.trpo import TRPO
@@ -8,4 +9,4 @@ from trainers.trpo import TRPO
 @hookimpl
 def ventosa_trainers() -> dict[str, type]:
     """Return the built-in algorithms by name."""
-    return {"ppo": PPO, "trpo": TRPO}
+    return {"ddpg": DDPG, "ppo": PPO, "trpo": TRPO}

@@ -23,17 +23,22 @@ TINY_STD = 1e-6
 NETWORK_PATH = "trainer.network_settings"
 
 
-class PolicySettings(NetworkSettings, frozen=True, extra="forbid"):
-    """Networks of the actor and the critic."""
+class ActorCriticSettings(NetworkSettings, frozen=True, extra="forbid"):
+    """Networks of an actor and a critic, and what each of them sees."""
 
-    critic: Literal["shared", "separate"] = Field(
-        "shared", description="A critic on the actor's hidden vector, or one with its own network."
-    )
     actor_observations: tuple[str, ...] | None = Field(
         None, description="What the policy sees; null: every observation but `privileged`."
     )
     critic_observations: tuple[str, ...] | None = Field(
         None, description="What a separate critic sees; null: what the policy sees."
+    )
+
+
+class PolicySettings(ActorCriticSettings, frozen=True, extra="forbid"):
+    """Networks of the actor and the critic."""
+
+    critic: Literal["shared", "separate"] = Field(
+        "shared", description="A critic on the actor's hidden vector, or one with its own network."
     )
     initial_std: float = Field(
         1.0, gt=0.0, description="Continuous actions: standard deviation to begin with."
@@ -66,12 +71,7 @@ class ActorCritic(nn.Module):
 
     def __init__(self, factory: NetworkFactory, settings: PolicySettings):
         super().__init__()
-        everything = tuple(factory.observation_space.spaces)
-        actor = settings.actor_observations or tuple(n for n in everything if n != "privileged")
-        critic = settings.critic_observations or actor
-        for path, names in (("actor_observations", actor), ("critic_observations", critic)):
-            for name in names:
-                factory.check_name(name, f"{NETWORK_PATH}.{path}")
+        actor, critic = observed(factory, settings)
         self.actor = factory.network(settings, actor)
         self.critic = factory.network(settings, critic) if settings.critic == "separate" else None
         width = self.actor.features_dim
@@ -168,6 +168,23 @@ def _with_rows(features: Tensor | None, rows: Tensor, other: Tensor | None) -> T
     if features is None or other is None:
         return None
     return features.index_copy(0, rows, other)
+
+
+def observed(
+    factory: NetworkFactory, settings: ActorCriticSettings
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the observations that the actor and the critic see.
+
+    Raises:
+        UserError: the environment does not have them.
+    """
+    everything = tuple(factory.observation_space.spaces)
+    actor = settings.actor_observations or tuple(n for n in everything if n != "privileged")
+    critic = settings.critic_observations or actor
+    for path, names in (("actor_observations", actor), ("critic_observations", critic)):
+        for name in names:
+            factory.check_name(name, f"{NETWORK_PATH}.{path}")
+    return actor, critic
 
 
 def to_environment(actions: Tensor, space: gymnasium.Space) -> np.ndarray:

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from trainers.observations import Observations, is_frame
+from trainers.observations import Observations, is_frame, take
 
 
 class FrameStore:
@@ -83,7 +83,7 @@ class Rollout:
     def observations(self, rows: Tensor) -> Observations:
         """Observations of some transitions, with the frames they share once."""
         frames, index = self.frame_index[rows].unique(return_inverse=True)
-        chosen = {name: _take(tensor, frames) for name, tensor in self.frames.items()}
+        chosen = {name: take(tensor, frames) for name, tensor in self.frames.items()}
         return Observations(chosen, {k: v[rows] for k, v in self.vectors.items()}, index)
 
     def minibatches(self, size: int, generator: torch.Generator) -> Iterator[Tensor]:
@@ -102,13 +102,6 @@ class Rollout:
 def frame_spaces(space: gymnasium.spaces.Dict) -> dict[str, gymnasium.Space[Any]]:
     """The spaces of the images among the observations."""
     return {name: part for name, part in space.spaces.items() if is_frame(part)}
-
-
-def _take(tensor: Tensor, index: Tensor) -> Tensor:
-    # torch indexes uint16 through its signed twin, which has all the operations.
-    if tensor.dtype == torch.uint16:
-        return tensor.view(torch.int16)[index].view(torch.uint16)
-    return tensor[index]
 
 
 def _dtype(space: gymnasium.Space[Any]) -> torch.dtype:

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from trainers.algorithm import TrainerSettings
+from trainers.descent import check_finite
 from trainers.distributions import Distribution
 from trainers.interaction import Interaction
 from trainers.metrics import Averager
@@ -138,7 +139,7 @@ class TRPO(OnPolicyAlgorithm):
         distribution = self.policy.distribution(observations)
         gain, old = gain_of(distribution), distribution.detach()
         gradient = flat_gradient(gain, self._theta)
-        self._check_finite(-gain, gradient.norm())
+        check_finite(-gain, gradient.norm(), self._interaction.step_count)
 
         def measure() -> tuple[Tensor, Tensor]:
             new = self.policy.distribution(observations)

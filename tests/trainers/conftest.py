@@ -333,14 +333,18 @@ def make_factory() -> Callable[..., NetworkFactory]:
 
 def sections(environment: Any, trainer: Mapping[str, Any], rest: Mapping[str, Any]) -> dict:
     """A run file's data: a toy by its name, and a small trainer."""
+    name = trainer.get("trainer_type", "ppo")
     small = {
-        "trainer_type": "ppo",
+        "trainer_type": name,
         "max_steps": 64,
         "summary_freq": 16,
         "checkpoint_interval": 32,
         "hyperparameters": {"batch_size": 8, "buffer_size": 16, "num_epoch": 1},
         "network_settings": {"hidden_units": 8, "num_layers": 1},
     }
+    if name == "ddpg":
+        memory = {"batch_size": 8, "buffer_size": 64, "buffer_init_steps": 16}
+        small |= {"time_horizon": 4, "hyperparameters": memory}
     merged = {**small, **trainer}
     for key in ("hyperparameters", "network_settings"):
         merged[key] = {**small[key], **trainer.get(key, {})}  # type: ignore[dict-item]

@@ -183,6 +183,44 @@ def test_two_halves_make_the_same_whole(
     np.testing.assert_equal(as_arrays(got.state), as_arrays(expected.state))
 
 
+@pytest.mark.parametrize("ended_by", ["limit", "stop"])
+def test_two_halves_make_the_same_whole_where_the_replay_buffer_is_saved(
+    training: Callable[..., Training], ended_by: str
+) -> None:
+    def halves(max_steps: int, **options: Any) -> Training:
+        hyper = {
+            "save_replay_buffer": True,
+            "updates_per_step": 0.3,
+            "n_step": 2,
+            "random_actions": 0.2,
+            "noise": {"type": "ornstein_uhlenbeck", "sigma": 0.2},
+        }
+        trainer = {
+            "trainer_type": "ddpg",
+            "max_steps": max_steps,
+            "hyperparameters": hyper,
+            "network_settings": {"normalize": True},
+        }
+        return training(trainer, curriculum=LESSONS, **options)
+
+    whole = halves(128, folder="whole")  # more than the buffer takes
+    assert whole.train()
+    first = (
+        halves(80, folder="halves")
+        if ended_by == "limit"
+        else halves(128, folder="halves", stop_at_step=84)
+    )
+    first.train()
+    assert first.saved[-1] == 80
+    second = halves(128, folder="halves")
+    second.resume()
+    assert second.train()
+    expected, got = whole.checkpoints.load_latest(), second.checkpoints.load_latest()
+    for name, tensor in expected.weights.items():
+        assert torch.equal(tensor, got.weights[name]), name
+    np.testing.assert_equal(as_arrays(got.state), as_arrays(expected.state))
+
+
 def as_arrays(state: Any) -> Any:
     if isinstance(state, torch.Tensor):
         return state.numpy()
