@@ -32,8 +32,13 @@ def descend(
     optimizer.zero_grad(set_to_none=True)
     loss.backward(inputs=parameters)
     norm = nn.utils.clip_grad_norm_(parameters, max_gradient_norm)
-    if not torch.isfinite(loss + norm):
-        raise NonFiniteError(
-            f"step {step}: the loss is {loss.item()}, its gradient's norm {norm.item()}"
-        )
+    check_finite(loss, norm, step)
     optimizer.step()
+
+
+def check_finite(loss: Tensor, gradient_norm: Tensor, step: int) -> None:
+    """Raises NonFiniteError, naming the run's step, where a loss or its gradient is not finite."""
+    if not torch.isfinite(loss + gradient_norm):
+        raise NonFiniteError(
+            f"step {step}: the loss is {loss.item()}, its gradient's norm {gradient_norm.item()}"
+        )

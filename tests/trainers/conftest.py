@@ -8,6 +8,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from trainers.plugins import BUILT_IN_PLUGINS, Registries, load_registries, plug
 from trainers.ppo import PPO
 from trainers.session import Session
 from trainers.settings import Component, RunSettings, load_run
+from trainers.trpo import TRPO
 
 PICTURE_SIDE_PX = 8
 
@@ -387,21 +389,36 @@ def make_session(
 
 
 @pytest.fixture
-def make_ppo(make_session: Callable[..., Session]) -> Callable[..., PPO]:
-    """PPO on a toy: `make_ppo("target", {"gamma": 0.0}, {"hidden_units": 4})`."""
+def make_algorithm(make_session: Callable[..., Session]) -> Callable[..., Any]:
+    """An algorithm on a toy: `make_algorithm("trpo", "target", {"gamma": 0.0}, {...})`."""
 
     def make(
+        trainer_type: str,
         environment: Any = "target",
         hyperparameters: Mapping[str, Any] | None = None,
         network: Mapping[str, Any] | None = None,
         **rest: Any,
-    ) -> PPO:
-        trainer = {"hyperparameters": hyperparameters or {}, "network_settings": network or {}}
-        algorithm = make_session(environment, trainer, **rest).algorithm
-        assert isinstance(algorithm, PPO)
-        return algorithm
+    ) -> Any:
+        trainer = {
+            "trainer_type": trainer_type,
+            "hyperparameters": hyperparameters or {},
+            "network_settings": network or {},
+        }
+        return make_session(environment, trainer, **rest).algorithm
 
     return make
+
+
+@pytest.fixture
+def make_ppo(make_algorithm: Callable[..., Any]) -> Callable[..., PPO]:
+    """PPO on a toy: `make_ppo("target", {"gamma": 0.0}, {"hidden_units": 4})`."""
+    return partial(make_algorithm, "ppo")
+
+
+@pytest.fixture
+def make_trpo(make_algorithm: Callable[..., Any]) -> Callable[..., TRPO]:
+    """TRPO on a toy: arguments as `make_ppo`'s."""
+    return partial(make_algorithm, "trpo")
 
 
 @dataclass

@@ -140,14 +140,28 @@ def test_a_stop_before_the_first_step_can_be_taken_up_too(
 
 
 @pytest.mark.parametrize("ended_by", ["limit", "stop"])
-@pytest.mark.parametrize("critic", ["shared", "separate"])
+@pytest.mark.parametrize(
+    ("algorithm", "critic", "own"),
+    [
+        ("ppo", "shared", {"beta_schedule": "constant"}),
+        ("ppo", "separate", {"beta_schedule": "constant"}),
+        ("trpo", "separate", {"fisher_fraction": 0.5}),
+    ],
+)
 def test_two_halves_make_the_same_whole(
-    training: Callable[..., Training], ended_by: str, critic: str
+    training: Callable[..., Training],
+    ended_by: str,
+    algorithm: str,
+    critic: str,
+    own: dict[str, Any],
 ) -> None:
     def trainer(max_steps: int) -> dict[str, Any]:
-        hyper = {"learning_rate_schedule": "constant", "beta_schedule": "constant", "num_epoch": 2}
-        network = {"critic": critic, "normalize": True}
-        return {"max_steps": max_steps, "hyperparameters": hyper, "network_settings": network}
+        return {
+            "trainer_type": algorithm,
+            "max_steps": max_steps,
+            "hyperparameters": {"learning_rate_schedule": "constant", "num_epoch": 2, **own},
+            "network_settings": {"critic": critic, "normalize": True},
+        }
 
     whole = training(trainer(96), folder="whole", curriculum=LESSONS)
     assert whole.train()
