@@ -55,7 +55,7 @@ class PeerVecEnv(VecEnv):
         of_each: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done.any():
             final = self._arrays(infos["final_obs"])
-            for i in np.flatnonzero(done):
+            for i in np.flatnonzero(done).tolist():
                 of_each[i] = {
                     "terminal_observation": _row(final, i),
                     "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
@@ -96,7 +96,7 @@ def _space(space: gymnasium.Space[Any]) -> gymnasium.Space[Any]:
     """The space of one observation with the channels of images first."""
     if isinstance(space, Box) and is_frame(space):
         low, high = np.moveaxis(space.low, -1, 0), np.moveaxis(space.high, -1, 0)
-        return Box(low, high, dtype=space.dtype)  # type: ignore[arg-type]
+        return Box(low, high, dtype=space.dtype)
     return space
 
 

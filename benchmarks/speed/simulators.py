@@ -12,6 +12,7 @@ from benchmarks.agreement import Sample
 from benchmarks.speed.environments import EPISODE_STEPS
 from benchmarks.speed.figures import FAST, PYBULLET, Case, Figure
 from benchmarks.speed.timing import Samples, interleave, rate
+from encoders.spaces import DepthImage
 from envs.grasp.observations import observation_space
 from envs.grasp.settings import Camera, GraspSettings
 from envs.grasp.simulators.factory import make_simulator
@@ -19,9 +20,7 @@ from envs.grasp.simulators.factory import make_simulator
 WHATS = {"depth": "depth frames", "rgb": "color frames"}
 
 
-def measure(
-    sizes: Sequence[int], num_worlds: int, repeats: int, seconds: float
-) -> list[Figure]:
+def measure(sizes: Sequence[int], num_worlds: int, repeats: int, seconds: float) -> list[Figure]:
     """Measures both simulators, on all cores.
 
     Args:
@@ -59,8 +58,8 @@ class _Set:
         self.simulator = make_simulator(settings, num_worlds)
         self._sample = Sample(num_worlds, (size, size))
         self._views = self._sample.views[kind]
-        self._space = observation_space(settings)[kind]
-        self._is_depth = kind == "depth"
+        space = observation_space(settings)[kind]
+        self._space = space if isinstance(space, DepthImage) else None
         self._rng, self._pictures = np.random.default_rng(0), 0
 
     def change(self) -> None:
@@ -76,9 +75,9 @@ class _Set:
     def shoot(self) -> int:
         """Takes a picture of every world, depth as the sensor delivers it; returns how many."""
         everywhere = self._sample.everywhere
-        if self._is_depth:
+        if self._space is None:
+            self.simulator.render(everywhere, self._views)
+        else:
             seeds = self._rng.integers(2**63, size=len(everywhere), dtype=np.uint64)
             self.simulator.sense(everywhere, self._views, self._space, seeds)
-        else:
-            self.simulator.render(everywhere, self._views)
         return len(everywhere)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 from stable_baselines3 import PPO
@@ -23,7 +24,7 @@ class StableBaselines:
         env = make_vector_env(rewards=setup.rewards, **setup.environment())
         encoder = Paper(
             env.single_observation_space[CAMERA],  # type: ignore[arg-type]
-            Paper.Settings(size=setup.size),  # type: ignore[arg-type]
+            Paper.Settings(size=setup.size),
         )
         self._env, self._buffer_size = PeerVecEnv(env), setup.buffer_size
         self._ppo = _TimedPPO(
@@ -64,7 +65,7 @@ class _Extractor(BaseFeaturesExtractor):
     def __init__(self, space: Any, encoder: Paper, setup: Setup):
         super().__init__(space, setup.hidden_units)
         widths = [encoder.features_dim] + [setup.hidden_units] * setup.num_layers
-        trunk = [dense(*sides, "relu") for sides in zip(widths, widths[1:], strict=False)]
+        trunk = [dense(*sides, "relu") for sides in pairwise(widths)]
         self.layers = nn.Sequential(encoder.convolutions, nn.Flatten(), *trunk)
 
     def forward(self, images: Tensor) -> Tensor:

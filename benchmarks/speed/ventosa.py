@@ -78,7 +78,7 @@ def _run(setup: Setup) -> RunSettings:
             WeightedReward(Component(name, rewards[name], rewards[name].Settings()), weight)  # type: ignore[attr-defined]
             for name, weight in setup.rewards.items()
         ),
-        encoders={CAMERA: Component("paper", Paper, Paper.Settings(size=setup.size))},  # type: ignore[arg-type]
+        encoders={CAMERA: Component("paper", Paper, Paper.Settings(size=setup.size))},
         curriculum=None,
         environment_parameters={},
         trainer=Component("ppo", PPO, _trainer(setup)),
