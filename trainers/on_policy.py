@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trainers.interaction import Interaction, Step
+from trainers.memory import Sequences
 from trainers.observations import Observations, to_tensors
 from trainers.policy import ActorCritic, FrameFeatures, to_environment
 from trainers.returns import gae
@@ -21,6 +22,8 @@ from trainers.timers import timed
 
 class OnPolicyCollector:
     """Plays T steps in each of N environments with a policy that does not change meanwhile.
+
+    What the policy remembers of its running episodes is carried from one collection to the next.
 
     Args:
         policy: draws the actions and values the observations.
@@ -42,6 +45,7 @@ class OnPolicyCollector:
         self._generator, self._device = generator, device
         env = interaction.env
         self._space, self._action_space = env.single_observation_space, env.single_action_space
+        self._remembered = policy.initial_state(env.num_envs)
 
     @torch.no_grad()
     def collect(self, gamma: float, lambd: float) -> Rollout:
@@ -52,11 +56,15 @@ class OnPolicyCollector:
         """
         frames = _Frames(self._policy, self._interaction, self._steps, self._device)
         moments = [self._play(frames) for _ in range(self._steps)]
-        last = to_tensors(self._interaction.observations, self._space, self._device)
-        advantages, returns = self._estimate(moments, self._policy.value(last), gamma, lambd)
+        last_values = self._values(self._interaction.observations, self._remembered)
+        advantages, returns = self._estimate(moments, last_values, gamma, lambd)
+        frame_index = torch.cat([moment.frame_index for moment in moments])
+        length = self._policy.sequence_length
         return Rollout(
             frames=frames.tensors(),
-            frame_index=torch.cat([moment.frame_index for moment in moments]),
+            frame_index=frame_index,
+            groups=frame_index if length is None else self._sequences(moments, length),
+            states=torch.cat([moment.state for moment in moments]),
             vectors={
                 name: torch.cat([moment.vectors[name] for moment in moments])
                 for name in moments[0].vectors
@@ -68,35 +76,77 @@ class OnPolicyCollector:
             returns=returns.flatten(),
         )
 
+    def state_dict(self) -> dict[str, Any]:
+        """What is remembered of the running episodes."""
+        return {"remembered": self._remembered}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes back to a state."""
+        self._remembered = state["remembered"].to(self._device)
+
     def _play(self, frames: _Frames) -> _Moment:
         """Acts once in every environment."""
-        raw = self._interaction.observations
+        raw, state = self._interaction.observations, self._remembered
         frame_index, features = frames.look(raw)
         with timed("act"):
             vectors = {name: values for name, values in raw.items() if name not in frames.names}
             observations = to_tensors(vectors, self._space, self._device)
-            distribution, values = self._policy(observations, features)
+            observations = replace(observations, sequences=Sequences.single(state))
+            distribution, values, after = self._policy.step(observations, features)
             actions = distribution.sample(self._generator)
         step = self._interaction.step(to_environment(actions, self._action_space))
         frames.new = np.flatnonzero(~step.same_frame)
+        self._remembered = after.masked_fill(self._tensor(step.done)[:, None], 0.0)
         return _Moment(
             frame_index=frame_index,
             vectors=observations.vectors,
+            state=state,
             actions=actions,
             log_probs=distribution.log_prob(actions),
             values=values,
-            final_values=self._final_values(step, values),
+            final_values=self._final_values(step, after),
             step=step,
         )
 
-    def _final_values(self, step: Step, like: Tensor) -> Tensor:
-        """Values (N,) of the last observations of episodes that were cut off; else zero."""
-        values = torch.zeros_like(like)
-        rows = np.flatnonzero(step.truncated)
-        if len(rows) and step.final_observations is not None:
-            final = to_tensors(step.final_observations, self._space, self._device, rows)
-            values[torch.from_numpy(rows).to(self._device)] = self._policy.value(final)
+    def _values(
+        self,
+        raw: Mapping[str, NDArray[Any]],
+        state: Tensor,
+        rows: NDArray[np.int64] | None = None,
+    ) -> Tensor:
+        """Values of observations with what is remembered (B, m), in all environments or some."""
+        observations = to_tensors(raw, self._space, self._device, rows)
+        return self._policy.value(replace(observations, sequences=Sequences.single(state)))
+
+    def _final_values(self, step: Step, state: Tensor) -> Tensor:
+        """Values (N,) of the last observations of episodes that were cut off; else zero.
+
+        Args:
+            step: what has just happened.
+            state: (N, m) what is remembered after it.
+        """
+        values = torch.zeros(len(state), device=self._device)
+        numbers = np.flatnonzero(step.truncated)
+        if len(numbers) and step.final_observations is not None:
+            rows = self._tensor(numbers)
+            values[rows] = self._values(step.final_observations, state[rows], numbers)
         return values
+
+    def _sequences(self, moments: list[_Moment], length: int) -> Tensor:
+        """Numbers of the sequences of at most `length` steps that the steps belong to, (T * N,)."""
+        done = np.stack([moment.step.done for moment in moments])
+        number, age = np.arange(done.shape[1]), np.zeros(done.shape[1], np.int64)
+        numbers = np.empty(done.shape, np.int64)
+        for t in range(len(done)):
+            numbers[t] = number
+            age += 1
+            over = done[t] | (age == length)
+            number = np.where(over, number.max() + over.cumsum(), number)
+            age[over] = 0
+        return self._tensor(numbers.ravel())
+
+    def _tensor(self, array: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(array).to(self._device)
 
     def _estimate(
         self, moments: list[_Moment], last_values: Tensor, gamma: float, lambd: float
@@ -128,6 +178,7 @@ class _Moment:
 
     frame_index: Tensor
     vectors: dict[str, Tensor]
+    state: Tensor
     actions: Tensor
     log_probs: Tensor
     values: Tensor

@@ -103,10 +103,15 @@ class PPO:
         self._interaction = interaction
         self._rollout: Rollout | None = None
 
-    def act(self, observations: Observations, *, deterministic: bool) -> Tensor:
+    def initial_state(self, count: int) -> Tensor:
+        """See `Algorithm.initial_state`."""
+        return self.policy.initial_state(count)
+
+    def act(self, observations: Observations, *, deterministic: bool) -> tuple[Tensor, Tensor]:
         """See `Algorithm.act`."""
-        distribution = self.policy.distribution(observations)
-        return distribution.mode() if deterministic else distribution.sample(self._generator)
+        distribution, _, state = self.policy.step(observations)
+        actions = distribution.mode() if deterministic else distribution.sample(self._generator)
+        return actions, state
 
     def collect(self) -> None:
         """See `Algorithm.collect`."""
@@ -131,13 +136,18 @@ class PPO:
 
     def state_dict(self) -> dict[str, Any]:
         """See `Algorithm.state_dict`."""
-        return {"optimizer": self._optimizer.state_dict(), "generator": self._generator.get_state()}
+        return {
+            "optimizer": self._optimizer.state_dict(),
+            "generator": self._generator.get_state(),
+            "collector": self._collector.state_dict(),
+        }
 
     def load_state_dict(self, weights: dict[str, Tensor], state: dict[str, Any]) -> None:
         """See `Algorithm.load_state_dict`."""
         self.policy.load_state_dict(weights)
         self._optimizer.load_state_dict(state["optimizer"])
         self._generator.set_state(state["generator"])
+        self._collector.load_state_dict(state["collector"])
 
     def _set_schedules(self, progress: float) -> dict[str, float]:
         hyper = self._hyperparameters
