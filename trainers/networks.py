@@ -76,12 +76,7 @@ class Network(nn.Module):
             {k: e for k, e in encoders.items() if not is_frame(spaces[k])}
         )
         width = sum(cast(int, encoder.features_dim) for encoder in encoders.values())
-        layers: list[nn.Module] = []
-        for _ in range(settings.num_layers):
-            layers += [_orthogonal(nn.Linear(width, settings.hidden_units), gain=2**0.5)]
-            layers += [ACTIVATIONS[settings.activation]()]
-            width = settings.hidden_units
-        self.trunk = nn.Sequential(*layers)
+        self.trunk, width = hidden_layers(width, settings)
         self.memory = None if memory is None else Recurrent(width, memory)
         self.features_dim = width if self.memory is None else self.memory.features_dim
         self.state_size = 0 if self.memory is None else self.memory.state_size
@@ -205,6 +200,17 @@ def _orthogonal(layer: nn.Linear, gain: float) -> nn.Linear:
     nn.init.orthogonal_(layer.weight, gain)
     nn.init.zeros_(layer.bias)
     return layer
+
+
+def hidden_layers(inputs: int, settings: NetworkSettings) -> tuple[nn.Sequential, int]:
+    """The dense layers that follow the encoders, and how many numbers come out of them."""
+    layers: list[nn.Module] = []
+    width = inputs
+    for _ in range(settings.num_layers):
+        layers += [_orthogonal(nn.Linear(width, settings.hidden_units), gain=2**0.5)]
+        layers += [ACTIVATIONS[settings.activation]()]
+        width = settings.hidden_units
+    return nn.Sequential(*layers), width
 
 
 def head(inputs: int, outputs: int, gain: float) -> nn.Linear:

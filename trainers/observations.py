@@ -58,3 +58,11 @@ def to_tensors(
         tensor = torch.from_numpy(np.ascontiguousarray(chosen)).to(device)
         (frames if is_frame(space[name]) else vectors)[name] = tensor
     return Observations(frames, vectors)
+
+
+def take(tensor: Tensor, index: Tensor | tuple[Tensor, ...]) -> Tensor:
+    """Entries of a tensor of any type."""
+    # torch indexes uint16 through its signed twin, which has all the operations.
+    if tensor.dtype == torch.uint16:
+        return tensor.view(torch.int16)[index].view(torch.uint16)
+    return tensor[index]

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trainers.interaction import Interaction, Step
-from trainers.memory import Sequences
+from trainers.memory import Sequences, number_sequences
 from trainers.observations import Observations, to_tensors
 from trainers.policy import ActorCritic, FrameFeatures, to_environment
 from trainers.returns import gae
+from trainers.reward_normalizer import RewardNormalizer
 from trainers.rollout import FrameStore, Rollout, frame_spaces
 from trainers.timers import timed
 
@@ -31,6 +32,7 @@ class OnPolicyCollector:
         steps: T.
         generator: the source of the actions' randomness.
         device: where the policy lives.
+        reward_normalizer: scales the rewards that are learned from; None: they stay as they are.
     """
 
     def __init__(
@@ -40,9 +42,11 @@ class OnPolicyCollector:
         steps: int,
         generator: torch.Generator,
         device: torch.device,
+        reward_normalizer: RewardNormalizer | None = None,
     ):
         self._policy, self._interaction, self._steps = policy, interaction, steps
         self._generator, self._device = generator, device
+        self._reward_normalizer = reward_normalizer
         env = interaction.env
         self._space, self._action_space = env.single_observation_space, env.single_action_space
         self._remembered = policy.initial_state(env.num_envs)
@@ -59,11 +63,10 @@ class OnPolicyCollector:
         last_values = self._values(self._interaction.observations, self._remembered)
         advantages, returns = self._estimate(moments, last_values, gamma, lambd)
         frame_index = torch.cat([moment.frame_index for moment in moments])
-        length = self._policy.sequence_length
         return Rollout(
             frames=frames.tensors(),
             frame_index=frame_index,
-            groups=frame_index if length is None else self._sequences(moments, length),
+            groups=self._sequences(moments) if self._policy.state_size else frame_index,
             states=torch.cat([moment.state for moment in moments]),
             vectors={
                 name: torch.cat([moment.vectors[name] for moment in moments])
@@ -77,12 +80,18 @@ class OnPolicyCollector:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """What is remembered of the running episodes."""
-        return {"remembered": self._remembered}
+        """Everything needed to go on exactly."""
+        normalizer = self._reward_normalizer
+        return {
+            "remembered": self._remembered,
+            "reward_normalizer": None if normalizer is None else normalizer.state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes back to a state."""
         self._remembered = state["remembered"].to(self._device)
+        if self._reward_normalizer is not None:
+            self._reward_normalizer.load_state_dict(state["reward_normalizer"])
 
     def _play(self, frames: _Frames) -> _Moment:
         """Acts once in every environment."""
@@ -132,18 +141,10 @@ class OnPolicyCollector:
             values[rows] = self._values(step.final_observations, state[rows], numbers)
         return values
 
-    def _sequences(self, moments: list[_Moment], length: int) -> Tensor:
-        """Numbers of the sequences of at most `length` steps that the steps belong to, (T * N,)."""
+    def _sequences(self, moments: list[_Moment]) -> Tensor:
+        """Numbers (M,) of the sequences that the transitions belong to."""
         done = np.stack([moment.step.done for moment in moments])
-        number, age = np.arange(done.shape[1]), np.zeros(done.shape[1], np.int64)
-        numbers = np.empty(done.shape, np.int64)
-        for t in range(len(done)):
-            numbers[t] = number
-            age += 1
-            over = done[t] | (age == length)
-            number = np.where(over, number.max() + over.cumsum(), number)
-            age[over] = 0
-        return self._tensor(numbers.ravel())
+        return self._tensor(number_sequences(done, self._policy.sequence_length).ravel())
 
     def _tensor(self, array: NDArray[Any]) -> Tensor:
         return torch.from_numpy(array).to(self._device)
@@ -158,15 +159,19 @@ class OnPolicyCollector:
             return torch.from_numpy(array).to(self._device, dtype)
 
         terminated, truncated = stack("terminated", torch.bool), stack("truncated", torch.bool)
+        done = terminated | truncated
         values = torch.stack([moment.values for moment in moments])
         final_values = torch.stack([moment.final_values for moment in moments])
         following = torch.cat([values[1:], last_values[None]])
+        rewards = stack("reward", values.dtype)
+        if self._reward_normalizer is not None:
+            rewards = self._reward_normalizer(rewards, done)
         return gae(
-            stack("reward", values.dtype),
+            rewards,
             values,
             torch.where(truncated, final_values, following),
             terminated,
-            terminated | truncated,
+            done,
             gamma=gamma,
             lambd=lambd,
         )

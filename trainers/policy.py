@@ -25,26 +25,31 @@ TINY_STD = 1e-6
 NETWORK_PATH = "trainer.network_settings"
 
 
-class PolicySettings(NetworkSettings, frozen=True, extra="forbid"):
-    """Networks of the actor and the critic."""
+class ActorCriticSettings(NetworkSettings, frozen=True, extra="forbid"):
+    """Networks of an actor and a critic, and what each of them sees."""
 
-    critic: Literal["shared", "separate"] = Field(
-        "shared", description="A critic on the actor's hidden vector, or one with its own network."
-    )
     actor_observations: tuple[str, ...] | None = Field(
         None, description="What the policy sees; null: every observation but `privileged`."
     )
     critic_observations: tuple[str, ...] | None = Field(
         None, description="What a separate critic sees; null: what the policy sees."
     )
+
+
+class PolicySettings(ActorCriticSettings, frozen=True, extra="forbid"):
+    """Networks of the actor and the critic."""
+
+    critic: Literal["shared", "separate"] = Field(
+        "shared", description="A critic on the actor's hidden vector, or one with its own network."
+    )
     initial_std: float = Field(
         1.0, gt=0.0, description="Continuous actions: standard deviation to begin with."
     )
-    memory: MemorySettings | None = Field(
-        None, description="A recurrent layer in the actor and in a separate critic."
-    )
     min_std: float = Field(
         0.001, gt=0.0, description="Continuous actions: the standard deviation never falls below."
+    )
+    memory: MemorySettings | None = Field(
+        None, description="A recurrent layer in the actor and in a separate critic; null: none."
     )
 
     @model_validator(mode="after")
@@ -67,7 +72,7 @@ class ActorCritic(nn.Module):
 
     Attributes:
         state_size: numbers that the actor and a separate critic remember; 0 without memory.
-        sequence_length: steps through which gradients flow back; None without memory.
+        sequence_length: steps through which gradients flow back; 1 without memory.
 
     Raises:
         UserError: the settings don't fit the environment.
@@ -75,12 +80,7 @@ class ActorCritic(nn.Module):
 
     def __init__(self, factory: NetworkFactory, settings: PolicySettings):
         super().__init__()
-        everything = tuple(factory.observation_space.spaces)
-        actor = settings.actor_observations or tuple(n for n in everything if n != "privileged")
-        critic = settings.critic_observations or actor
-        for path, names in (("actor_observations", actor), ("critic_observations", critic)):
-            for name in names:
-                factory.check_name(name, f"{NETWORK_PATH}.{path}")
+        actor, critic = observed(factory, settings)
         self.actor = factory.network(settings, actor, settings.memory)
         self.critic = (
             factory.network(settings, critic, settings.memory)
@@ -90,7 +90,7 @@ class ActorCritic(nn.Module):
         self.state_size = self.actor.state_size
         if self.critic is not None:
             self.state_size += self.critic.state_size
-        self.sequence_length = None if settings.memory is None else settings.memory.sequence_length
+        self.sequence_length = 1 if settings.memory is None else settings.memory.sequence_length
         width = self.actor.features_dim
         self.action_head: nn.Linear
         self.log_std: nn.Parameter | None = None
@@ -210,6 +210,23 @@ def _with_rows(features: Tensor | None, rows: Tensor, other: Tensor | None) -> T
     if features is None or other is None:
         return None
     return features.index_copy(0, rows, other)
+
+
+def observed(
+    factory: NetworkFactory, settings: ActorCriticSettings
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the observations that the actor and the critic see.
+
+    Raises:
+        UserError: the environment does not have them.
+    """
+    everything = tuple(factory.observation_space.spaces)
+    actor = settings.actor_observations or tuple(n for n in everything if n != "privileged")
+    critic = settings.critic_observations or actor
+    for path, names in (("actor_observations", actor), ("critic_observations", critic)):
+        for name in names:
+            factory.check_name(name, f"{NETWORK_PATH}.{path}")
+    return actor, critic
 
 
 def to_environment(actions: Tensor, space: gymnasium.Space) -> np.ndarray:

@@ -3,41 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import torch
-from pydantic import BaseModel, Field, model_validator
-from torch import Tensor, nn
+from pydantic import Field
+from torch import Tensor
 
 from trainers.algorithm import TrainerSettings
 from trainers.distributions import Distribution
-from trainers.interaction import Interaction, NonFiniteError
+from trainers.interaction import Interaction
 from trainers.metrics import Averager
 from trainers.networks import NetworkFactory
-from trainers.observations import Observations
-from trainers.on_policy import OnPolicyCollector
+from trainers.on_policy_algorithm import OnPolicyAlgorithm, OnPolicyHyperparameters
 from trainers.policy import ActorCritic, PolicySettings
 from trainers.returns import explained_variance, normalize
 from trainers.rollout import Rollout
-from trainers.schedules import Schedule
-
-CONSTANT = Schedule(type="constant")
-LINEAR = Schedule(type="linear")
+from trainers.schedules import CONSTANT, LINEAR, Schedule
 
 
-class PPOHyperparameters(BaseModel, frozen=True, extra="forbid"):
+class PPOHyperparameters(OnPolicyHyperparameters, frozen=True, extra="forbid"):
     """Hyper-parameters of PPO, with ML-Agents' names where the thing is the same."""
 
-    batch_size: int = Field(512, ge=1, description="Transitions in one step of gradient descent.")
-    buffer_size: int = Field(8192, ge=1, description="Transitions collected before an update.")
-    num_epoch: int = Field(3, ge=1, description="Passes over the buffer in an update.")
     learning_rate: float = Field(3e-4, gt=0.0, description="Of the policy, to begin with.")
     critic_learning_rate: float | None = Field(
         None, gt=0.0, description="Of the critic, to begin with; null: the policy's."
     )
-    learning_rate_schedule: Schedule = Field(LINEAR, description="Course of both learning rates.")
-    gamma: float = Field(0.99, ge=0.0, le=1.0, description="Discount factor.")
-    lambd: float = Field(0.95, ge=0.0, le=1.0, description="Lambda of the advantage estimate.")
     epsilon: float = Field(0.2, gt=0.0, description="How far the probability ratio may move.")
     epsilon_schedule: Schedule = Field(CONSTANT, description="Course of epsilon.")
     beta: float = Field(5e-3, ge=0.0, description="Weight of the entropy bonus.")
@@ -50,16 +39,6 @@ class PPOHyperparameters(BaseModel, frozen=True, extra="forbid"):
     value_clipping: float | None = Field(
         None, gt=0.0, description="How far a value may move in an update; null: anywhere."
     )
-    max_gradient_norm: float = Field(0.5, gt=0.0, description="Gradients are clipped to this norm.")
-
-    @model_validator(mode="after")
-    def _batch_fits(self) -> PPOHyperparameters:
-        if self.batch_size > self.buffer_size:
-            raise ValueError(
-                f"batch_size {self.batch_size} is over buffer_size {self.buffer_size}: lower "
-                "batch_size, or raise buffer_size"
-            )
-        return self
 
 
 class PPOSettings(TrainerSettings, frozen=True, extra="forbid"):
@@ -73,7 +52,7 @@ class PPOSettings(TrainerSettings, frozen=True, extra="forbid"):
     )
 
 
-class PPO:
+class PPO(OnPolicyAlgorithm):
     """PPO with a clipped objective. See `trainers.algorithm.Algorithm`."""
 
     Settings = PPOSettings
@@ -86,43 +65,14 @@ class PPO:
         generator: torch.Generator,
         device: torch.device,
     ):
-        self._hyperparameters = hyper = settings.hyperparameters
-        self._generator = generator
-        self.policy = ActorCritic(factory, settings.network_settings).to(device)
-        self._optimizer = torch.optim.Adam(
-            [
-                {"params": list(self.policy.actor_parameters())},
-                {"params": list(self.policy.critic_parameters())},
-            ],
-            lr=hyper.learning_rate,
-            eps=1e-5,
-            fused=True,
-        )
-        steps = -(-hyper.buffer_size // interaction.env.num_envs)
-        self._collector = OnPolicyCollector(self.policy, interaction, steps, generator, device)
-        self._interaction = interaction
-        self._rollout: Rollout | None = None
-
-    def initial_state(self, count: int) -> Tensor:
-        """See `Algorithm.initial_state`."""
-        return self.policy.initial_state(count)
-
-    def act(self, observations: Observations, *, deterministic: bool) -> tuple[Tensor, Tensor]:
-        """See `Algorithm.act`."""
-        distribution, _, state = self.policy.step(observations)
-        actions = distribution.mode() if deterministic else distribution.sample(self._generator)
-        return actions, state
-
-    def collect(self) -> None:
-        """See `Algorithm.collect`."""
-        hyper = self._hyperparameters
-        self._rollout = self._collector.collect(hyper.gamma, hyper.lambd)
+        self._hyperparameters = settings.hyperparameters
+        policy = ActorCritic(factory, settings.network_settings).to(device)
+        groups = (policy.actor_parameters(), policy.critic_parameters())
+        super().__init__(policy, groups, settings.hyperparameters, interaction, generator, device)
 
     def update(self, progress: float) -> Mapping[str, float]:
         """See `Algorithm.update`."""
-        rollout, self._rollout = self._rollout, None
-        if rollout is None:
-            raise RuntimeError("update() comes after collect()")
+        rollout = self._take_rollout()
         schedules = self._set_schedules(progress)
         advantages = normalize(rollout.advantages)
         averager = Averager()
@@ -133,21 +83,6 @@ class PPO:
         statistics = averager.take()
         variance = explained_variance(rollout.returns, rollout.values)
         return statistics | schedules | {"Policy/Explained Variance": variance}
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `Algorithm.state_dict`."""
-        return {
-            "optimizer": self._optimizer.state_dict(),
-            "generator": self._generator.get_state(),
-            "collector": self._collector.state_dict(),
-        }
-
-    def load_state_dict(self, weights: dict[str, Tensor], state: dict[str, Any]) -> None:
-        """See `Algorithm.load_state_dict`."""
-        self.policy.load_state_dict(weights)
-        self._optimizer.load_state_dict(state["optimizer"])
-        self._generator.set_state(state["generator"])
-        self._collector.load_state_dict(state["collector"])
 
     def _set_schedules(self, progress: float) -> dict[str, float]:
         hyper = self._hyperparameters
@@ -205,19 +140,6 @@ class PPO:
             if hyper.target_kl is not None and means["Policy/KL"] > hyper.target_kl:
                 return False
         return True
-
-    def _descend(self, loss: Tensor) -> None:
-        self._optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = nn.utils.clip_grad_norm_(
-            self.policy.parameters(), self._hyperparameters.max_gradient_norm
-        )
-        if not torch.isfinite(loss + norm):
-            raise NonFiniteError(
-                f"step {self._interaction.step_count}: the loss is {loss.item()}, its gradient's "
-                f"norm {norm.item()}"
-            )
-        self._optimizer.step()
 
 
 def surrogate_loss(

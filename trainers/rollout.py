@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trainers.memory import Sequences
-from trainers.observations import Observations, is_frame
+from trainers.observations import Observations, is_frame, take
 
 
 class FrameStore:
@@ -62,9 +62,9 @@ class Rollout:
         frames: by name, (U, H, W, C).
         frame_index: which of the U frames belongs to each transition.
         vectors: by name, (M, n).
-        groups: numbers from 0 of what stays together: transitions of one frame; of a policy with
-            memory those of one sequence.
-        states: (M, m) what the policy remembered before each.
+        groups: the number, from 0, of the group that each belongs to, which stays together: the
+            transitions of one frame or, of a policy with memory, those of one sequence.
+        states: (M, m) what the policy remembered before each; m is 0 without memory.
         actions: as the policy drew them, before any clipping.
         log_probs: of the actions under the policy that drew them.
         values: under the critic of that time.
@@ -90,14 +90,18 @@ class Rollout:
         """Observations of some transitions, with the frames they share once.
 
         Args:
-            rows: (B,) in an order that `minibatches` gives.
+            rows: (B,) in an order that `minibatches` or `in_groups` gives.
         """
         frames, index = self.frame_index[rows].unique(return_inverse=True)
-        chosen = {name: _take(tensor, frames) for name, tensor in self.frames.items()}
+        chosen = {name: take(tensor, frames) for name, tensor in self.frames.items()}
         vectors = {name: values[rows] for name, values in self.vectors.items()}
         _, lengths = self.groups[rows].unique_consecutive(return_counts=True)
         first = rows[lengths.cumsum(0) - lengths]
         return Observations(chosen, vectors, index, Sequences(lengths.cpu(), self.states[first]))
+
+    def in_groups(self) -> Tensor:
+        """All rows (M,), those of one group side by side and in the order of time."""
+        return self.groups.argsort(stable=True)
 
     def minibatches(self, size: int, generator: torch.Generator) -> Iterator[Tensor]:
         """Splits all transitions at random into parts of `size` rows; the last may be smaller.
@@ -116,13 +120,6 @@ class Rollout:
 def frame_spaces(space: gymnasium.spaces.Dict) -> dict[str, gymnasium.Space[Any]]:
     """The spaces of the images among the observations."""
     return {name: part for name, part in space.spaces.items() if is_frame(part)}
-
-
-def _take(tensor: Tensor, index: Tensor) -> Tensor:
-    # torch indexes uint16 through its signed twin, which has all the operations.
-    if tensor.dtype == torch.uint16:
-        return tensor.view(torch.int16)[index].view(torch.uint16)
-    return tensor[index]
 
 
 def _dtype(space: gymnasium.Space[Any]) -> torch.dtype:

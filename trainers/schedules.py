@@ -82,3 +82,7 @@ class Schedule(BaseModel, frozen=True, extra="forbid"):
         # final + (initial - final) * (1 - progress) ** power, in the form exact at both ends
         weight = (1 - progress) ** (1.0 if self.power is None else self.power)
         return initial * weight + initial * self.final_fraction * (1 - weight)
+
+
+CONSTANT = Schedule(type="constant")
+LINEAR = Schedule(type="linear")

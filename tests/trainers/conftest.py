@@ -8,6 +8,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from trainers.plugins import BUILT_IN_PLUGINS, Registries, load_registries, plug
 from trainers.ppo import PPO
 from trainers.session import Session
 from trainers.settings import Component, RunSettings, load_run
+from trainers.trpo import TRPO
 
 PICTURE_SIDE_PX = 8
 
@@ -331,14 +333,18 @@ def make_factory() -> Callable[..., NetworkFactory]:
 
 def sections(environment: Any, trainer: Mapping[str, Any], rest: Mapping[str, Any]) -> dict:
     """A run file's data: a toy by its name, and a small trainer."""
+    name = trainer.get("trainer_type", "ppo")
     small = {
-        "trainer_type": "ppo",
+        "trainer_type": name,
         "max_steps": 64,
         "summary_freq": 16,
         "checkpoint_interval": 32,
         "hyperparameters": {"batch_size": 8, "buffer_size": 16, "num_epoch": 1},
         "network_settings": {"hidden_units": 8, "num_layers": 1},
     }
+    if name == "ddpg":
+        memory = {"batch_size": 8, "buffer_size": 64, "buffer_init_steps": 16}
+        small |= {"time_horizon": 4, "hyperparameters": memory}
     merged = {**small, **trainer}
     for key in ("hyperparameters", "network_settings"):
         merged[key] = {**small[key], **trainer.get(key, {})}  # type: ignore[dict-item]
@@ -383,21 +389,36 @@ def make_session(
 
 
 @pytest.fixture
-def make_ppo(make_session: Callable[..., Session]) -> Callable[..., PPO]:
-    """PPO on a toy: `make_ppo("target", {"gamma": 0.0}, {"hidden_units": 4})`."""
+def make_algorithm(make_session: Callable[..., Session]) -> Callable[..., Any]:
+    """An algorithm on a toy: `make_algorithm("trpo", "target", {"gamma": 0.0}, {...})`."""
 
     def make(
+        trainer_type: str,
         environment: Any = "target",
         hyperparameters: Mapping[str, Any] | None = None,
         network: Mapping[str, Any] | None = None,
         **rest: Any,
-    ) -> PPO:
-        trainer = {"hyperparameters": hyperparameters or {}, "network_settings": network or {}}
-        algorithm = make_session(environment, trainer, **rest).algorithm
-        assert isinstance(algorithm, PPO)
-        return algorithm
+    ) -> Any:
+        trainer = {
+            "trainer_type": trainer_type,
+            "hyperparameters": hyperparameters or {},
+            "network_settings": network or {},
+        }
+        return make_session(environment, trainer, **rest).algorithm
 
     return make
+
+
+@pytest.fixture
+def make_ppo(make_algorithm: Callable[..., Any]) -> Callable[..., PPO]:
+    """PPO on a toy: `make_ppo("target", {"gamma": 0.0}, {"hidden_units": 4})`."""
+    return partial(make_algorithm, "ppo")
+
+
+@pytest.fixture
+def make_trpo(make_algorithm: Callable[..., Any]) -> Callable[..., TRPO]:
+    """TRPO on a toy: arguments as `make_ppo`'s."""
+    return partial(make_algorithm, "trpo")
 
 
 @dataclass

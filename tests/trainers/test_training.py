@@ -140,14 +140,28 @@ def test_a_stop_before_the_first_step_can_be_taken_up_too(
 
 
 @pytest.mark.parametrize("ended_by", ["limit", "stop"])
-@pytest.mark.parametrize("critic", ["shared", "separate"])
+@pytest.mark.parametrize(
+    ("algorithm", "critic", "own"),
+    [
+        ("ppo", "shared", {"beta_schedule": "constant"}),
+        ("ppo", "separate", {"beta_schedule": "constant"}),
+        ("trpo", "separate", {"fisher_fraction": 0.5}),
+    ],
+)
 def test_two_halves_make_the_same_whole(
-    training: Callable[..., Training], ended_by: str, critic: str
+    training: Callable[..., Training],
+    ended_by: str,
+    algorithm: str,
+    critic: str,
+    own: dict[str, Any],
 ) -> None:
     def trainer(max_steps: int) -> dict[str, Any]:
-        hyper = {"learning_rate_schedule": "constant", "beta_schedule": "constant", "num_epoch": 2}
-        network = {"critic": critic, "normalize": True}
-        return {"max_steps": max_steps, "hyperparameters": hyper, "network_settings": network}
+        return {
+            "trainer_type": algorithm,
+            "max_steps": max_steps,
+            "hyperparameters": {"learning_rate_schedule": "constant", "num_epoch": 2, **own},
+            "network_settings": {"critic": critic, "normalize": True},
+        }
 
     whole = training(trainer(96), folder="whole", curriculum=LESSONS)
     assert whole.train()
@@ -164,6 +178,44 @@ def test_two_halves_make_the_same_whole(
     expected, got = whole.checkpoints.load_latest(), second.checkpoints.load_latest()
     assert expected.step == got.step == 96
     assert expected.state["curriculum"]["lesson"] == 1
+    for name, tensor in expected.weights.items():
+        assert torch.equal(tensor, got.weights[name]), name
+    np.testing.assert_equal(as_arrays(got.state), as_arrays(expected.state))
+
+
+@pytest.mark.parametrize("ended_by", ["limit", "stop"])
+def test_two_halves_make_the_same_whole_where_the_replay_buffer_is_saved(
+    training: Callable[..., Training], ended_by: str
+) -> None:
+    def halves(max_steps: int, **options: Any) -> Training:
+        hyper = {
+            "save_replay_buffer": True,
+            "updates_per_step": 0.3,
+            "n_step": 2,
+            "random_actions": 0.2,
+            "noise": {"type": "ornstein_uhlenbeck", "sigma": 0.2},
+        }
+        trainer = {
+            "trainer_type": "ddpg",
+            "max_steps": max_steps,
+            "hyperparameters": hyper,
+            "network_settings": {"normalize": True},
+        }
+        return training(trainer, curriculum=LESSONS, **options)
+
+    whole = halves(128, folder="whole")  # more than the buffer takes
+    assert whole.train()
+    first = (
+        halves(80, folder="halves")
+        if ended_by == "limit"
+        else halves(128, folder="halves", stop_at_step=84)
+    )
+    first.train()
+    assert first.saved[-1] == 80
+    second = halves(128, folder="halves")
+    second.resume()
+    assert second.train()
+    expected, got = whole.checkpoints.load_latest(), second.checkpoints.load_latest()
     for name, tensor in expected.weights.items():
         assert torch.equal(tensor, got.weights[name]), name
     np.testing.assert_equal(as_arrays(got.state), as_arrays(expected.state))
