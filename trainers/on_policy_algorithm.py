@@ -125,6 +125,7 @@ class OnPolicyAlgorithm:
         Raises:
             NonFiniteError: the loss or its gradient is NaN or infinite; nothing was changed.
         """
-        parameters = [p for group in self._optimizer.param_groups for p in group["params"]]
+        groups = self._optimizer.param_groups
+        parameters = [p for group in groups for p in group["params"] if p.requires_grad]
         step = self._interaction.step_count
         descend(self._optimizer, loss, parameters, self._max_gradient_norm, step)
