@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from envs.environment import Environment
 from trainers.algorithm import Algorithm
 from trainers.checkpoint import Loaded
 from trainers.errors import UserError
-from trainers.interaction import SUCCESS, Episodes, Interaction, concatenate
+from trainers.interaction import SUCCESS, Episodes, Interaction, Step, concatenate
+from trainers.memory import Sequences
 from trainers.observations import to_tensors
 from trainers.plugins import Registries, load_registries
 from trainers.policy import to_environment
@@ -105,6 +107,7 @@ class _Player:
             self._generator,
             torch.device("cpu"),
         )
+        self._remembered = self._algorithm.initial_state(env.num_envs)
 
     def load(self, weights: dict[str, torch.Tensor], where: str) -> None:
         """Takes over weights."""
@@ -114,14 +117,28 @@ class _Player:
         except RuntimeError as error:
             raise UserError(f"{where}: these weights do not fit the run's configuration") from error
 
+    def reset(self) -> None:
+        """Begins an episode everywhere."""
+        self.interaction.reset()
+        self._remembered = self._algorithm.initial_state(self.interaction.env.num_envs)
+
     @torch.no_grad()
     def actions(self, *, deterministic: bool) -> NDArray[Any]:
         """Actions for the present observations."""
         env = self.interaction.env
         space = env.single_observation_space
         observations = to_tensors(self.interaction.observations, space, torch.device("cpu"))
-        actions = self._algorithm.act(observations, deterministic=deterministic)
+        actions, self._remembered = self._algorithm.act(
+            replace(observations, sequences=Sequences.single(self._remembered)),
+            deterministic=deterministic,
+        )
         return to_environment(actions, env.single_action_space)
+
+    def step(self, *, deterministic: bool) -> Step:
+        """Acts once everywhere; where an episode ends, it is forgotten."""
+        step = self.interaction.step(self.actions(deterministic=deterministic))
+        self._remembered[torch.from_numpy(step.done)] = 0.0
+        return step
 
 
 def _whole_episodes(player: _Player, episodes: int, *, deterministic: bool) -> dict[str, Any]:
@@ -134,10 +151,9 @@ def _whole_episodes(player: _Player, episodes: int, *, deterministic: bool) -> d
     share = np.full(count, episodes // count) + (np.arange(count) < episodes % count)
     parts: list[Episodes] = []
     ended = np.zeros(count, np.int64)
-    interaction.reset()
+    player.reset()
     while (ended < share).any():
-        step = interaction.step(player.actions(deterministic=deterministic))
-        done = np.flatnonzero(step.terminated | step.truncated)
+        done = np.flatnonzero(player.step(deterministic=deterministic).done)
         finished = interaction.take_finished()
         parts.append(finished[ended[done] < share[done]])
         ended[done] += 1
@@ -156,7 +172,7 @@ def _first_actions(player: _Player, episodes: int) -> dict[str, Any]:
     interaction = player.interaction
     parts: list[dict[str, NDArray[Any]]] = []
     for _ in range(-(-episodes // interaction.env.num_envs)):
-        interaction.reset()
+        player.reset()
         *_, infos = interaction.env.step(player.actions(deterministic=True))
         if "position_error_m" not in infos.get("measures", {}):
             return {}

@@ -42,6 +42,11 @@ class Step:
     same_frame: NDArray[np.bool_]
     final_observations: Mapping[str, NDArray[Any]] | None
 
+    @property
+    def done(self) -> NDArray[np.bool_]:
+        """(N,) the episode ended, terminated or truncated."""
+        return self.terminated | self.truncated
+
 
 @dataclass(frozen=True)
 class Episodes:

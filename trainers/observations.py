@@ -16,6 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from trainers.memory import Sequences
+
 IMAGE_DIMENSIONS = 3
 
 
@@ -27,11 +29,14 @@ class Observations:
         frames: by name, images (U, H, W, C) in their own type.
         vectors: by name, (B, n).
         frame_index: (B,) which of the U frames belongs to each; None: U = B, in this order.
+        sequences: which of them follow each other, and what is remembered before; None: each is
+            the first of its episode. Only networks with memory ask.
     """
 
     frames: dict[str, Tensor]
     vectors: dict[str, Tensor]
     frame_index: Tensor | None = None
+    sequences: Sequences | None = None
 
 
 def is_frame(space: gymnasium.Space[Any]) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trainers.interaction import Interaction, Step
+from trainers.memory import Sequences, number_sequences
 from trainers.observations import Observations, to_tensors
 from trainers.policy import ActorCritic, FrameFeatures, to_environment
 from trainers.returns import gae
@@ -22,6 +23,8 @@ from trainers.timers import timed
 
 class OnPolicyCollector:
     """Plays T steps in each of N environments with a policy that does not change meanwhile.
+
+    What the policy remembers of its running episodes is carried from one collection to the next.
 
     Args:
         policy: draws the actions and values the observations.
@@ -46,6 +49,7 @@ class OnPolicyCollector:
         self._reward_normalizer = reward_normalizer
         env = interaction.env
         self._space, self._action_space = env.single_observation_space, env.single_action_space
+        self._remembered = policy.initial_state(env.num_envs)
 
     @torch.no_grad()
     def collect(self, gamma: float, lambd: float) -> Rollout:
@@ -56,11 +60,14 @@ class OnPolicyCollector:
         """
         frames = _Frames(self._policy, self._interaction, self._steps, self._device)
         moments = [self._play(frames) for _ in range(self._steps)]
-        last = to_tensors(self._interaction.observations, self._space, self._device)
-        advantages, returns = self._estimate(moments, self._policy.value(last), gamma, lambd)
+        last_values = self._values(self._interaction.observations, self._remembered)
+        advantages, returns = self._estimate(moments, last_values, gamma, lambd)
+        frame_index = torch.cat([moment.frame_index for moment in moments])
         return Rollout(
             frames=frames.tensors(),
-            frame_index=torch.cat([moment.frame_index for moment in moments]),
+            frame_index=frame_index,
+            groups=self._sequences(moments) if self._policy.state_size else frame_index,
+            states=torch.cat([moment.state for moment in moments]),
             vectors={
                 name: torch.cat([moment.vectors[name] for moment in moments])
                 for name in moments[0].vectors
@@ -75,42 +82,72 @@ class OnPolicyCollector:
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on exactly."""
         normalizer = self._reward_normalizer
-        return {"reward_normalizer": None if normalizer is None else normalizer.state_dict()}
+        return {
+            "remembered": self._remembered,
+            "reward_normalizer": None if normalizer is None else normalizer.state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes back to a state."""
+        self._remembered = state["remembered"].to(self._device)
         if self._reward_normalizer is not None:
             self._reward_normalizer.load_state_dict(state["reward_normalizer"])
 
     def _play(self, frames: _Frames) -> _Moment:
         """Acts once in every environment."""
-        raw = self._interaction.observations
+        raw, state = self._interaction.observations, self._remembered
         frame_index, features = frames.look(raw)
         with timed("act"):
             vectors = {name: values for name, values in raw.items() if name not in frames.names}
             observations = to_tensors(vectors, self._space, self._device)
-            distribution, values = self._policy(observations, features)
+            observations = replace(observations, sequences=Sequences.single(state))
+            distribution, values, after = self._policy.step(observations, features)
             actions = distribution.sample(self._generator)
         step = self._interaction.step(to_environment(actions, self._action_space))
         frames.new = np.flatnonzero(~step.same_frame)
+        self._remembered = after.masked_fill(self._tensor(step.done)[:, None], 0.0)
         return _Moment(
             frame_index=frame_index,
             vectors=observations.vectors,
+            state=state,
             actions=actions,
             log_probs=distribution.log_prob(actions),
             values=values,
-            final_values=self._final_values(step, values),
+            final_values=self._final_values(step, after),
             step=step,
         )
 
-    def _final_values(self, step: Step, like: Tensor) -> Tensor:
-        """Values (N,) of the last observations of episodes that were cut off; else zero."""
-        values = torch.zeros_like(like)
-        rows = np.flatnonzero(step.truncated)
-        if len(rows) and step.final_observations is not None:
-            final = to_tensors(step.final_observations, self._space, self._device, rows)
-            values[torch.from_numpy(rows).to(self._device)] = self._policy.value(final)
+    def _values(
+        self,
+        raw: Mapping[str, NDArray[Any]],
+        state: Tensor,
+        rows: NDArray[np.int64] | None = None,
+    ) -> Tensor:
+        """Values of observations with what is remembered (B, m), in all environments or some."""
+        observations = to_tensors(raw, self._space, self._device, rows)
+        return self._policy.value(replace(observations, sequences=Sequences.single(state)))
+
+    def _final_values(self, step: Step, state: Tensor) -> Tensor:
+        """Values (N,) of the last observations of episodes that were cut off; else zero.
+
+        Args:
+            step: what has just happened.
+            state: (N, m) what is remembered after it.
+        """
+        values = torch.zeros(len(state), device=self._device)
+        numbers = np.flatnonzero(step.truncated)
+        if len(numbers) and step.final_observations is not None:
+            rows = self._tensor(numbers)
+            values[rows] = self._values(step.final_observations, state[rows], numbers)
         return values
+
+    def _sequences(self, moments: list[_Moment]) -> Tensor:
+        """Numbers (M,) of the sequences that the transitions belong to."""
+        done = np.stack([moment.step.done for moment in moments])
+        return self._tensor(number_sequences(done, self._policy.sequence_length).ravel())
+
+    def _tensor(self, array: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(array).to(self._device)
 
     def _estimate(
         self, moments: list[_Moment], last_values: Tensor, gamma: float, lambd: float
@@ -146,6 +183,7 @@ class _Moment:
 
     frame_index: Tensor
     vectors: dict[str, Tensor]
+    state: Tensor
     actions: Tensor
     log_probs: Tensor
     values: Tensor
