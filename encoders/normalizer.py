@@ -35,6 +35,11 @@ class RunningNormalizer(nn.Module):
         self.register_buffer("variance", torch.ones(size, dtype=torch.float64))
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
+    @property
+    def deviation(self) -> torch.Tensor:
+        """(n,) float64, what vectors are divided by; never zero."""
+        return (self.variance + _LEAST_VARIANCE).sqrt()
+
     @torch.no_grad()
     def update(self, batch: torch.Tensor) -> None:
         """Merges the moments of a batch (B, n) into the running ones; an empty one changes nothing.
@@ -60,6 +65,5 @@ class RunningNormalizer(nn.Module):
 
     def forward(self, values: torch.Tensor) -> torch.Tensor:
         """(B, n) -> standardised, clipped to +-clip, (B, n) float32; changes no moment."""
-        deviation = (self.variance + _LEAST_VARIANCE).sqrt()
-        standard = (values.to(torch.float64) - self.mean) / deviation
+        standard = (values.to(torch.float64) - self.mean) / self.deviation
         return standard.clamp(-self.clip, self.clip).to(torch.float32)

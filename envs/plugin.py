@@ -1,10 +1,11 @@
 """The environments that ventosa brings along."""
 
 from envs.grasp.vector_env import GraspVectorEnv
+from envs.gym.vector_env import GymEnvironment
 from trainers.hookspecs import hookimpl
 
 
 @hookimpl
 def ventosa_environments() -> dict[str, type]:
     """Return the built-in environments by name."""
-    return {"grasp": GraspVectorEnv}
+    return {"grasp": GraspVectorEnv, "gymnasium": GymEnvironment}

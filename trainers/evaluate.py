@@ -51,7 +51,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         description="Report how good a policy is, on scenes never used for training.",
     )
     parser.add_argument("policy", help="a run (its best checkpoint) or a checkpoint's folder")
-    parser.add_argument("--episodes", type=_positive, default=1000, help="episodes of each kind")
+    parser.add_argument("--episodes", type=_positive, help="how many (default: the environment's)")
     parser.add_argument("--seed", type=_not_negative, default=0, help="of the scenes")
     parser.add_argument("--simulator", help="overrides `environment.simulator`")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here, too")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from torch import nn
 from curricula.samplers import ParameterValue
 from envs.environment import Environment
 from trainers.algorithm import Algorithm
+from trainers.checkpoint import Loaded
 from trainers.errors import UserError
 from trainers.interaction import SUCCESS, Episodes, Interaction, concatenate
 from trainers.observations import to_tensors
@@ -31,25 +33,28 @@ FIRST_ACTION, WHOLE_EPISODE = 0, 1
 def evaluate(
     policy: str,
     *,
-    episodes: int,
+    episodes: int | None,
     seed: int,
     overrides: Sequence[str] = (),
     results_dir: Path = Path("results"),
 ) -> dict[str, Any]:
     """Evaluates a policy on the last lesson's task.
 
+    Where the first action is to be right, as in grasping, it is judged by itself, and the whole
+    episodes are played as in training. Elsewhere they are played by the deterministic policy.
+
     Args:
         policy: a run's folder or id, or a checkpoint's folder.
-        episodes: how many, for the first actions and for the whole episodes each.
+        episodes: how many, for the first actions and for the whole episodes each; None: what the
+            environment is judged by.
         seed: of the scenes, which no training run has seen.
         overrides: `KEY=VALUE`s on top of the run's own configuration.
         results_dir: where a run is looked for by its id.
 
     Returns:
-        What is known of: `episodes`, `seed`; `success` of whole episodes with sampled actions;
-        and of the deterministic policy's first action `first_action_success`, `collision_rate`,
-        `position_error_m` and `yaw_error_deg`. `reward` and `episode_length` are of the whole
-        episodes.
+        What is known of: `episodes`, `seed`; of the deterministic policy's first action
+        `first_action_success`, `collision_rate`, `position_error_m` and `yaw_error_deg`; and of
+        the whole episodes `success`, the means `reward` and `episode_length`, and `reward_std`.
 
     Raises:
         UserError: there is no such policy, or it does not fit its configuration.
@@ -57,17 +62,12 @@ def evaluate(
     registries = load_registries()
     loaded = find_checkpoint(policy, results_dir)
     run = load_run(run_folder(loaded.path) / CONFIGURATION, overrides, registries)
-    figures: dict[str, Any] = {"episodes": episodes, "seed": seed}
-    for part, play in ((WHOLE_EPISODE, _whole_episodes), (FIRST_ACTION, _first_actions)):
-        env = build_environment(run, seed=FIRST_SEED + 2 * seed + part)
-        try:
-            env.set_parameters(final_parameters(run))
-            player = _Player(run, registries, env, seed)
-            player.load(loaded.weights, str(loaded.path))
-            figures |= play(player, episodes)
-        finally:
-            env.close()
-    return figures
+    with _player(run, registries, loaded, seed, FIRST_ACTION) as player:
+        count = episodes or player.interaction.env.evaluation_episodes
+        first = _first_actions(player, count)
+    with _player(run, registries, loaded, seed, WHOLE_EPISODE) as player:
+        whole = _whole_episodes(player, count, deterministic=not first)
+    return {"episodes": count, "seed": seed, **whole, **first}
 
 
 def final_parameters(run: RunSettings) -> dict[str, ParameterValue]:
@@ -75,6 +75,21 @@ def final_parameters(run: RunSettings) -> dict[str, ParameterValue]:
     curriculum = build_curriculum(run)
     lesson = {} if curriculum is None else curriculum.final_parameters()
     return {**run.environment_parameters, **lesson}
+
+
+@contextmanager
+def _player(
+    run: RunSettings, registries: Registries, loaded: Loaded, seed: int, part: int
+) -> Iterator[_Player]:
+    """The policy before scenes of its own for each part of the evaluation."""
+    env = build_environment(run, seed=FIRST_SEED + 2 * seed + part)
+    try:
+        env.set_parameters(final_parameters(run))
+        player = _Player(run, registries, env, seed)
+        player.load(loaded.weights, str(loaded.path))
+        yield player
+    finally:
+        env.close()
 
 
 class _Player:
@@ -109,8 +124,8 @@ class _Player:
         return to_environment(actions, env.single_action_space)
 
 
-def _whole_episodes(player: _Player, episodes: int) -> dict[str, Any]:
-    """Plays until every environment has ended its share of episodes, with sampled actions.
+def _whole_episodes(player: _Player, episodes: int, *, deterministic: bool) -> dict[str, Any]:
+    """Plays until every environment has ended its share of episodes.
 
     Shares, because the first episodes to end would be the short ones, which are the good ones.
     """
@@ -121,7 +136,7 @@ def _whole_episodes(player: _Player, episodes: int) -> dict[str, Any]:
     ended = np.zeros(count, np.int64)
     interaction.reset()
     while (ended < share).any():
-        step = interaction.step(player.actions(deterministic=False))
+        step = interaction.step(player.actions(deterministic=deterministic))
         done = np.flatnonzero(step.terminated | step.truncated)
         finished = interaction.take_finished()
         parts.append(finished[ended[done] < share[done]])
@@ -131,6 +146,7 @@ def _whole_episodes(player: _Player, episodes: int) -> dict[str, Any]:
     return {
         **success,
         "reward": float(played.rewards.mean()),
+        "reward_std": float(played.rewards.std()),
         "episode_length": float(played.lengths.mean()),
     }
 

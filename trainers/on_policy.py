@@ -15,6 +15,7 @@ from trainers.interaction import Interaction, Step
 from trainers.observations import Observations, to_tensors
 from trainers.policy import ActorCritic, FrameFeatures, to_environment
 from trainers.returns import gae
+from trainers.reward_normalizer import RewardNormalizer
 from trainers.rollout import FrameStore, Rollout, frame_spaces
 from trainers.timers import timed
 
@@ -28,6 +29,7 @@ class OnPolicyCollector:
         steps: T.
         generator: the source of the actions' randomness.
         device: where the policy lives.
+        reward_normalizer: scales the rewards that are learned from; None: they stay as they are.
     """
 
     def __init__(
@@ -37,9 +39,11 @@ class OnPolicyCollector:
         steps: int,
         generator: torch.Generator,
         device: torch.device,
+        reward_normalizer: RewardNormalizer | None = None,
     ):
         self._policy, self._interaction, self._steps = policy, interaction, steps
         self._generator, self._device = generator, device
+        self._reward_normalizer = reward_normalizer
         env = interaction.env
         self._space, self._action_space = env.single_observation_space, env.single_action_space
 
@@ -67,6 +71,16 @@ class OnPolicyCollector:
             advantages=advantages.flatten(),
             returns=returns.flatten(),
         )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on exactly."""
+        normalizer = self._reward_normalizer
+        return {"reward_normalizer": None if normalizer is None else normalizer.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes back to a state."""
+        if self._reward_normalizer is not None:
+            self._reward_normalizer.load_state_dict(state["reward_normalizer"])
 
     def _play(self, frames: _Frames) -> _Moment:
         """Acts once in every environment."""
@@ -108,15 +122,19 @@ class OnPolicyCollector:
             return torch.from_numpy(array).to(self._device, dtype)
 
         terminated, truncated = stack("terminated", torch.bool), stack("truncated", torch.bool)
+        done = terminated | truncated
         values = torch.stack([moment.values for moment in moments])
         final_values = torch.stack([moment.final_values for moment in moments])
         following = torch.cat([values[1:], last_values[None]])
+        rewards = stack("reward", values.dtype)
+        if self._reward_normalizer is not None:
+            rewards = self._reward_normalizer(rewards, done)
         return gae(
-            stack("reward", values.dtype),
+            rewards,
             values,
             torch.where(truncated, final_values, following),
             terminated,
-            terminated | truncated,
+            done,
             gamma=gamma,
             lambd=lambd,
         )

@@ -13,6 +13,7 @@ from trainers.interaction import Interaction, NonFiniteError
 from trainers.observations import Observations
 from trainers.on_policy import OnPolicyCollector
 from trainers.policy import ActorCritic
+from trainers.reward_normalizer import RewardNormalizer
 from trainers.rollout import Rollout
 from trainers.schedules import LINEAR, Schedule
 
@@ -26,6 +27,9 @@ class OnPolicyHyperparameters(BaseModel, frozen=True, extra="forbid"):
     learning_rate_schedule: Schedule = Field(LINEAR, description="Course of the learning rates.")
     gamma: float = Field(0.99, ge=0.0, le=1.0, description="Discount factor.")
     lambd: float = Field(0.95, ge=0.0, le=1.0, description="Lambda of the advantage estimate.")
+    normalize_rewards: bool = Field(
+        False, description="Scale rewards by the standard deviation of the discounted returns."
+    )
     max_gradient_norm: float = Field(0.5, gt=0.0, description="Gradients are clipped to this norm.")
 
     @model_validator(mode="after")
@@ -64,9 +68,13 @@ class OnPolicyAlgorithm:
         self._optimizer = torch.optim.Adam(
             [{"params": list(group)} for group in groups], eps=1e-5, fused=True
         )
-        steps = -(-hyperparameters.buffer_size // interaction.env.num_envs)
-        self._collector = OnPolicyCollector(policy, interaction, steps, generator, device)
-        self._gamma, self._lambd = hyperparameters.gamma, hyperparameters.lambd
+        count, gamma = interaction.env.num_envs, hyperparameters.gamma
+        steps = -(-hyperparameters.buffer_size // count)
+        normalizer = RewardNormalizer(count, gamma) if hyperparameters.normalize_rewards else None
+        self._collector = OnPolicyCollector(
+            policy, interaction, steps, generator, device, normalizer
+        )
+        self._gamma, self._lambd = gamma, hyperparameters.lambd
         self._max_gradient_norm = hyperparameters.max_gradient_norm
         self._interaction, self._generator = interaction, generator
         self._rollout: Rollout | None = None
@@ -82,12 +90,17 @@ class OnPolicyAlgorithm:
 
     def state_dict(self) -> dict[str, Any]:
         """See `Algorithm.state_dict`."""
-        return {"optimizer": self._optimizer.state_dict(), "generator": self._generator.get_state()}
+        return {
+            "optimizer": self._optimizer.state_dict(),
+            "collector": self._collector.state_dict(),
+            "generator": self._generator.get_state(),
+        }
 
     def load_state_dict(self, weights: dict[str, Tensor], state: dict[str, Any]) -> None:
         """See `Algorithm.load_state_dict`."""
         self.policy.load_state_dict(weights)
         self._optimizer.load_state_dict(state["optimizer"])
+        self._collector.load_state_dict(state["collector"])
         self._generator.set_state(state["generator"])
 
     def _take_rollout(self) -> Rollout:

@@ -28,7 +28,7 @@ class ProgressLine:
         step: environment steps taken.
         reward: mean return of the last episodes; None before any has ended.
         lesson: index of the current lesson, from 0 (shown from 1).
-        success: share of successful episodes, 0 to 1; None before any has ended.
+        success: share of successful episodes, 0 to 1; None where there is none to show.
         steps_per_second: current speed, environment steps per second of wall clock.
         seconds_left: estimate for the rest of the run; None where there is none yet.
     """
@@ -127,10 +127,15 @@ class _Display:
         lesson = (
             [f"lesson {line.lesson + 1}/{self._lesson_count}"] if self._lesson_count > 1 else []
         )
+        success = (
+            [f"success {_if_known(line.success, lambda share: f'{share:.0%}')}"]
+            if line.success is not None
+            else []
+        )
         return [
             f"reward {_if_known(line.reward, lambda reward: f'{reward:.3f}')}",
             *lesson,
-            f"success {_if_known(line.success, lambda share: f'{share:.0%}')}",
+            *success,
             f"{_if_known(line.steps_per_second, format_count)} steps/s",
         ]
 

@@ -57,6 +57,7 @@ class GraspVectorEnv(Environment):
     parameter_names: ClassVar[frozenset[str]] = frozenset(
         {*GOAL_PARAMETERS, "noise_sigma_m", "block_yaw_limit_deg"}
     )
+    evaluation_episodes: ClassVar[int] = 1000
     metadata: dict[str, Any] = {  # noqa: RUF012
         "autoreset_mode": AutoresetMode.SAME_STEP,
         "render_modes": ["human", "rgb_array"],

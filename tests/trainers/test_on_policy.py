@@ -18,6 +18,7 @@ from trainers.interaction import Interaction
 from trainers.networks import NetworkFactory
 from trainers.on_policy import OnPolicyCollector
 from trainers.policy import ActorCritic, PolicySettings
+from trainers.reward_normalizer import RewardNormalizer
 from trainers.rollout import Rollout
 from trainers.settings import Component
 
@@ -95,6 +96,32 @@ def test_truncated_episodes_go_on_in_value_and_terminated_ones_do_not(
     assert rollout.advantages.tolist() == [0, -5.5, -2, -36, 0.5, -14.5]
     assert rollout.returns.tolist() == [3, 15.5, 3, 5, 7.5, 46.5]
     assert rollout.vectors["x"].flatten().tolist() == [1, 10, 2, 20, 3, 30]
+
+
+def test_normalized_rewards_are_for_the_learner_alone(
+    scripted: Any, make_factory: MakeFactory
+) -> None:
+    env = scripted(
+        PLAIN,
+        {"x": columns([0, 0, 0])},
+        reward=[[2], [6]],
+        truncated=[[0], [1]],
+        final={"x": columns([0, 0])},
+    )
+    torch.manual_seed(0)
+    policy = ActorCritic(make_factory(PLAIN.spaces), PolicySettings(num_layers=0))
+    value_is(policy, 0.0, 0.0)
+    interaction = Interaction(env)
+    interaction.reset()
+    normalizer = RewardNormalizer(1, gamma=0.0)
+    generator = torch.Generator().manual_seed(0)
+    collector = OnPolicyCollector(policy, interaction, 2, generator, CPU, normalizer)
+    rollout = collector.collect(gamma=0.0, lambd=0.0)
+    assert rollout.returns.tolist() == pytest.approx([1.0, 3.0])  # the deviation of 2 and 6 is 2
+    assert interaction.take_finished().rewards.tolist() == [8.0]
+    other = OnPolicyCollector(policy, interaction, 2, generator, CPU, RewardNormalizer(1, 0.0))
+    other.load_state_dict(collector.state_dict())
+    assert other.state_dict() == collector.state_dict()
 
 
 def test_an_end_that_is_both_counts_as_terminated(scripted: Any, make_factory: MakeFactory) -> None:

@@ -1,0 +1,75 @@
+"""Episodes of any environment that can be played again, so that a run can go on exactly.
+
+The state of a gymnasium environment is its own affair and can't be saved. But an environment whose
+only randomness is gymnasium's `np_random` does the same again from the same seed with the same
+actions. So every episode begins with a seed of its own, and a running one is restored by playing
+it again.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+
+def episode_seed(run_seed: int, index: int, episode: int) -> int:
+    """The seed, from 0 to 2^31 - 1, of an episode (from 0) of one of a run's environments."""
+    # As a spawn key, because entropy of different lengths may be the same: (1, 0) is (1,).
+    word = np.random.SeedSequence(run_seed, spawn_key=(index, episode)).generate_state(1)[0]
+    return int(word >> 1)  # some environments pass it to generators that take 31 bits
+
+
+class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """One of a run's environments; seeds each of its episodes.
+
+    Its infos stay empty: to gather those of many environments takes longer than many a step, and
+    nobody reads them.
+
+    Args:
+        env: the environment.
+        run_seed: of the run.
+        index: which of the run's environments it is, from 0.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], run_seed: int, index: int):
+        super().__init__(env)
+        self._run_seed, self._index = run_seed, index
+        self._begun = 0
+
+    def count_from(self, run_seed: int, begun: NDArray[np.int64]) -> None:
+        """Goes to where some episodes had begun.
+
+        Args:
+            run_seed: of the run.
+            begun: (N,) how many, of all the run's environments.
+        """
+        self._run_seed, self._begun = run_seed, int(begun[self._index])
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins the next episode, with its own seed whatever `seed` is."""
+        own = episode_seed(self._run_seed, self._index, self._begun)
+        self._begun += 1
+        observation, _ = self.env.reset(seed=own, options=options)
+        return observation, {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Steps the environment."""
+        observation, reward, terminated, truncated, _ = self.env.step(action)
+        return observation, reward, terminated, truncated, {}
+
+    def play(self, lengths: NDArray[np.int64], actions: NDArray[Any]) -> Any:
+        """Plays an episode from its beginning; returns the last observation.
+
+        Args:
+            lengths: (N,) steps of the episode, of all the run's environments.
+            actions: (T, N, ...) the last T steps' actions, T being the greatest length.
+        """
+        observation, _ = self.reset()
+        for action in actions[len(actions) - lengths[self._index] :, self._index]:
+            observation, *_ = self.env.step(action)
+        return observation

@@ -1,0 +1,85 @@
+"""From settings to gymnasium's vector environment; what stands in the way is said plainly."""
+
+from __future__ import annotations
+
+import difflib
+import multiprocessing
+import signal
+from functools import partial
+from typing import Any
+
+import gymnasium
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+
+from envs.gym.episodes import RepeatableEpisodes
+from envs.gym.settings import GymSettings
+
+GymVectorEnv = SyncVectorEnv[Any, Any] | AsyncVectorEnv[Any, Any]
+EXTRAS = {"gymnasium.envs.mujoco": "mujoco", "gymnasium.envs.box2d": "box2d"}
+"""Packages of environments -> our optional dependencies that they need."""
+
+
+def make_vector_env(settings: GymSettings, seed: int) -> GymVectorEnv:
+    """Makes N environments that are stepped together and reset in the step an episode ends in.
+
+    Args:
+        settings: which, and how many.
+        seed: of all their episodes.
+
+    Raises:
+        ValueError: it does not exist, lacks a package, or refuses its arguments.
+    """
+    makers = [partial(_make_one, settings, seed, index) for index in range(settings.num_envs)]
+    vectorize = SyncVectorEnv if settings.vectorization == "sync" else AsyncVectorEnv
+    # Whoever reads the observations copies them anyway.
+    return vectorize(makers, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+def make(settings: GymSettings) -> gymnasium.Env[Any, Any]:
+    """Makes a single environment; errors as `make_vector_env`."""
+    name = settings.id
+    try:
+        env: gymnasium.Env[Any, Any] = gymnasium.make(
+            name, max_episode_steps=settings.max_episode_steps, **settings.kwargs
+        )
+    except (gymnasium.error.UnregisteredEnv, gymnasium.error.DeprecatedEnv) as error:
+        raise ValueError(
+            f"id: gymnasium knows no environment {name!r}; {_nearest(name)}"
+        ) from error
+    except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
+        raise ValueError(f"id: {name!r} lacks a package: {error}{_remedy(name)}") from error
+    except Exception as error:  # an environment is foreign code: it can refuse in any way
+        given = f" with kwargs {settings.kwargs}" if settings.kwargs else ""
+        raise ValueError(
+            f"{name!r} can't be made{given}: {type(error).__name__}: {error}"
+        ) from error
+    if settings.flatten_observations:
+        env = gymnasium.wrappers.FlattenObservation(env)
+    return env
+
+
+def _make_one(settings: GymSettings, seed: int, index: int) -> gymnasium.Env[Any, Any]:
+    if multiprocessing.parent_process() is not None:
+        # A process of its own: Ctrl-C is for the learner, which ends its environments.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    return RepeatableEpisodes(make(settings), seed, index)
+
+
+def _nearest(name: str) -> str:
+    close = difflib.get_close_matches(name, gymnasium.registry, n=3)
+    if close:
+        return "did you mean " + " or ".join(f"'{match}'" for match in close) + "?"
+    return (
+        "if a package of its own registers it, write MODULE:ID, and the module is imported first; "
+        "gymnasium.pprint_registry() lists the others"
+    )
+
+
+def _remedy(name: str) -> str:
+    spec = gymnasium.registry.get(name)
+    entry = spec.entry_point if spec is not None else None
+    for package, extra in EXTRAS.items():
+        if isinstance(entry, str) and entry.startswith(package):
+            return f"; install it: pip install 'ventosa[{extra}]'"
+    return ""

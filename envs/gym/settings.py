@@ -1,0 +1,29 @@
+"""Settings of gymnasium's environments."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, Field
+
+
+class GymSettings(BaseModel, frozen=True, extra="forbid"):
+    """Any environment that is registered with gymnasium."""
+
+    id: str = Field(
+        min_length=1,
+        description="Its id, such as Pendulum-v1; MODULE:ID imports the module that registers it.",
+    )
+    num_envs: int = Field(1, ge=1, le=65536, description="Environments stepped together.")
+    vectorization: Literal["sync", "async"] = Field(
+        "sync", description="All in this process one after the other, or each in a process."
+    )
+    max_episode_steps: int | None = Field(
+        None, ge=1, description="Steps before an episode is truncated; null: the environment's own."
+    )
+    flatten_observations: bool = Field(
+        False, description="Make one vector of an observation, whatever its space is."
+    )
+    kwargs: dict[str, Any] = Field(
+        default_factory=dict, description="What else gymnasium.make is given."
+    )

@@ -1,0 +1,182 @@
+"""Any environment registered with gymnasium: N of them, stepped together."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
+from numpy.typing import NDArray
+
+from envs.environment import Environment, EnvironmentFailure, Observations, StepResult
+from envs.gym.making import make_vector_env
+from envs.gym.settings import GymSettings
+from envs.gym.spaces import ActionAdapter, ObservationAdapter
+from rewards.reward import RewardTerm
+
+_logger = logging.getLogger("ventosa")
+
+
+class GymEnvironment(Environment):
+    """N environments of gymnasium, with their own rewards. See `Environment`.
+
+    A state to go on from is the number of each environment's episode, which gives its seed, and its
+    actions so far: what happened is played again. That is exact where an environment draws
+    everything from gymnasium's `np_random` and keeps nothing from one episode to the next; where it
+    is not, a warning is logged.
+
+    Args:
+        settings: which environment.
+        rewards: none; they are the environment's affair.
+        seed: of everything that is drawn.
+
+    Raises:
+        ValueError: there is no such environment, it can't be made, or it does not fit.
+    """
+
+    Settings = GymSettings
+
+    def __init__(self, settings: GymSettings, rewards: Sequence[RewardTerm], seed: int = 0):
+        if rewards:
+            names = ", ".join(term.name for term in rewards)
+            raise ValueError(
+                f"{settings.id!r} has its own rewards, and those of the run file ({names}) don't "
+                "apply: leave `rewards` out"
+            )
+        self._id, self._seed = settings.id, seed
+        self.num_envs = settings.num_envs
+        self._vector = make_vector_env(settings, seed)
+        try:
+            self._observe = ObservationAdapter(self._vector.single_observation_space)
+            self._act = ActionAdapter(self._vector.single_action_space)
+        except ValueError:
+            self.close()
+            raise
+        self.single_observation_space = self._observe.space
+        self.single_action_space = self._act.space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._begun = np.zeros(self.num_envs, np.int64)
+        self._lengths = np.zeros(self.num_envs, np.int64)
+        self._actions: list[NDArray[Any]] = []  # as many steps as the longest episode has
+        self._observations: Observations = {}
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Begins new episodes everywhere.
+
+        Raises:
+            ValueError: there are options: an episode begun with them could not be played again.
+        """
+        if options:
+            raise ValueError(f"options {options} are not supported")
+        if seed is not None:
+            self._seed = int(seed)
+            self._begun[:] = 0
+            self._call("count_from", self._seed, self._begun)
+        self._begun += 1
+        self._lengths[:] = 0
+        self._actions.clear()
+        observations, _ = self._guarded(self._vector.reset)
+        self._observations = self._observe(observations)
+        return self._observations, {}
+
+    def step(self, actions: NDArray[Any]) -> StepResult:
+        """Steps every environment.
+
+        Raises:
+            EnvironmentFailure: one of them raised an error, or its process died.
+        """
+        actions = self._act(actions)
+        observations, reward, terminated, truncated, gathered = self._guarded(
+            self._vector.step, actions
+        )
+        self._actions.append(actions)
+        self._lengths += 1
+        done = terminated | truncated
+        infos: dict[str, Any] = {}
+        if done.any():
+            infos = {"final_obs": self._final(gathered["final_obs"], done), "_final_obs": done}
+            self._begun[done] += 1
+            self._lengths[done] = 0
+            del self._actions[: len(self._actions) - self._lengths.max()]
+        self._observations = self._observe(observations)
+        return self._observations, reward, terminated, truncated, infos
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Environment.state_dict`."""
+        actions = np.array(self._actions, self.action_space.dtype)
+        return {
+            "seed": self._seed,
+            "begun": self._begun.copy(),
+            "lengths": self._lengths.copy(),
+            "actions": actions.reshape(-1, *(self.action_space.shape or ())),
+            "observations": self._observations,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> Observations:
+        """See `Environment.load_state_dict`; plays the running episodes again."""
+        self._seed = state["seed"]
+        self._begun, self._lengths = state["begun"].copy(), state["lengths"].copy()
+        self._actions = list(state["actions"])
+        self._call("count_from", self._seed, self._begun - 1)
+        played = self._call("play", self._lengths, state["actions"])
+        self._observations = self._observe(self._stacked(played))
+        if not _equal(self._observations, state["observations"]):
+            _logger.warning(
+                "the environment %r did not come back to where it was: played again, its episodes "
+                "go another way, so this run goes on well, but not exactly",
+                self._id,
+            )
+        return self._observations
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Ends the environments, and their processes even where one has died."""
+        try:
+            self._vector.close()
+        except (OSError, EOFError):
+            for process in getattr(self._vector, "processes", ()):
+                process.terminate()
+                process.join()
+            self._vector.closed = True
+
+    def _final(self, last: NDArray[Any], done: NDArray[np.bool_]) -> Observations:
+        """Observations (N, ...), right where episodes ended, from an array (N,) of objects."""
+        ended = self._observe(self._stacked(list(last[done])))
+        final = {
+            name: np.zeros((self.num_envs, *values.shape[1:]), values.dtype)
+            for name, values in ended.items()
+        }
+        for name, values in ended.items():
+            final[name][done] = values
+        return final
+
+    def _stacked(self, observations: Sequence[Any]) -> Any:
+        """Observations of k environments as gymnasium batches them."""
+        space = self._vector.single_observation_space
+        out: Any = create_empty_array(space, len(observations))
+        return concatenate(space, observations, out)
+
+    def _call(self, method: str, *arguments: Any) -> Any:
+        return self._guarded(self._vector.call, method, *arguments)
+
+    def _guarded(self, function: Any, *arguments: Any) -> Any:
+        """Calls into the environments, which may fail in any way."""
+        try:
+            return function(*arguments)
+        except (EOFError, ConnectionError) as error:
+            raise EnvironmentFailure(
+                f"the environment {self._id!r} failed: one of its processes died"
+            ) from error
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}".removesuffix(": ")
+            raise EnvironmentFailure(f"the environment {self._id!r} failed: {reason}") from error
+
+
+def _equal(first: Observations, second: Observations) -> bool:
+    return first.keys() == second.keys() and all(
+        np.array_equal(values, second[name]) for name, values in first.items()
+    )

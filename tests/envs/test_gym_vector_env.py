@@ -1,0 +1,322 @@
+"""Any gymnasium environment: against gymnasium stepped by hand, resumed, and refused."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Dict, Discrete
+
+from envs.environment import EnvironmentFailure
+from envs.gym.episodes import episode_seed
+from envs.gym.settings import GymSettings
+from envs.gym.vector_env import GymEnvironment
+from rewards.reward import RewardTerm
+
+ROOM_STEPS = 6
+
+
+class Room(gymnasium.Env[Any, Any]):
+    """Observations of three kinds; ends or is cut off after a few steps that its seed decides.
+
+    Args:
+        trouble: what befalls the environment in its third step: nothing, an error, or the death of
+            its process; or `forgetful`: it draws from elsewhere than `np_random`.
+    """
+
+    observation_space = Dict(
+        {
+            "place": Box(-np.inf, np.inf, (2,), np.float64),
+            "door": Discrete(3),
+            "view": Box(0, 255, (4, 5, 3), np.uint8),
+        }
+    )
+    action_space = Discrete(3, start=1)
+    elsewhere = np.random.default_rng(0)
+
+    def __init__(self, trouble: str | None = None):
+        self.trouble = trouble
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.seed, self.steps, self.sum = seed, 0, 0
+        self.length = int(self.np_random.integers(2, ROOM_STEPS))
+        return self._observation(), {"ignored": "info"}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        assert self.action_space.contains(action), action
+        self.steps += 1
+        self.sum += int(action)
+        if self.steps == 2 and self.trouble == "error":
+            raise RuntimeError("the room collapsed")
+        if self.steps == 2 and self.trouble == "death":
+            os.kill(os.getpid(), signal.SIGKILL)
+        over = self.steps == self.length
+        return self._observation(), float(action), over and self.sum % 2 == 0, over, {}
+
+    def _observation(self) -> dict[str, Any]:
+        rng = self.elsewhere if self.trouble == "forgetful" else self.np_random
+        return {
+            "place": np.array([self.sum, rng.normal()]),
+            "door": int(rng.integers(3)),
+            "view": rng.integers(0, 256, (4, 5, 3), np.uint8),
+        }
+
+
+@pytest.fixture(autouse=True)
+def registered() -> Iterator[None]:
+    gymnasium.register("ventosa_tests/Room-v0", entry_point=Room)
+    yield
+    del gymnasium.registry["ventosa_tests/Room-v0"]
+
+
+def make(env_id: str = "ventosa_tests/Room-v0", count: int = 3, **settings: Any) -> GymEnvironment:
+    return GymEnvironment(GymSettings(id=env_id, num_envs=count, **settings), [], seed=7)
+
+
+def actions_for(env: GymEnvironment, steps: int) -> list[np.ndarray]:
+    env.action_space.seed(0)
+    return [env.action_space.sample() for _ in range(steps)]
+
+
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+def test_it_does_what_the_environments_do_one_by_one(vectorization: str) -> None:
+    with closing(make(vectorization=vectorization)) as env:
+        observations, _ = env.reset()
+        alone = [Room() for _ in range(3)]
+        begun = [0, 0, 0]
+        expected = [room.reset(seed=episode_seed(7, i, 0))[0] for i, room in enumerate(alone)]
+        for actions in actions_for(env, 40):
+            observations, reward, terminated, truncated, infos = env.step(actions)
+            assert env.observation_space.contains(observations)
+            for i, room in enumerate(alone):
+                expected[i], *rest, _ = room.step(np.int64(actions[i] + 1))
+                assert (reward[i], terminated[i], truncated[i]) == tuple(rest)
+                if any(rest[1:]):
+                    assert infos["_final_obs"][i]
+                    np.testing.assert_array_equal(
+                        infos["final_obs"]["view"][i], expected[i]["view"]
+                    )
+                    begun[i] += 1
+                    expected[i], _ = room.reset(seed=episode_seed(7, i, begun[i]))
+                elif infos:
+                    assert not infos["_final_obs"][i]
+                np.testing.assert_array_equal(observations["view"][i], expected[i]["view"])
+                np.testing.assert_array_equal(
+                    observations["place"][i], expected[i]["place"].astype(np.float32)
+                )
+                assert observations["door"][i].argmax() == expected[i]["door"]
+        assert min(begun) > 5
+
+
+def test_every_episode_has_a_seed_of_its_own() -> None:
+    runs = (0, 1, 2, 2**32, 2**32 + 1)  # the last two are evaluations
+    seeds = {episode_seed(s, i, e) for s in runs for i in range(5) for e in range(40)}
+    assert len(seeds) == 1000
+    assert all(0 <= seed < 2**31 for seed in seeds)
+
+
+def test_observations_that_were_handed_out_stay_as_they_were() -> None:
+    env = make()
+    first, _ = env.reset()
+    kept = {name: values.copy() for name, values in first.items()}
+    for actions in actions_for(env, 3):
+        env.step(actions)
+    assert all(np.array_equal(values, kept[name]) for name, values in first.items())
+
+
+def test_a_seed_given_to_reset_begins_anew() -> None:
+    env = make()
+    runs = []
+    for seed in (3, 4, 3):
+        env.reset(seed=seed)
+        runs.append([env.step(actions)[0]["view"] for actions in actions_for(env, 20)])
+    assert np.array_equal(runs[0], runs[2])
+    assert not np.array_equal(runs[0], runs[1])
+    with pytest.raises(ValueError, match=r"options .* are not supported"):
+        env.reset(options={"low": 1})
+
+
+# -- going on -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("env_id", "vectorization", "module"),
+    [
+        ("ventosa_tests/Room-v0", "sync", None),
+        ("ventosa_tests/Room-v0", "async", None),
+        ("Pendulum-v1", "sync", None),
+        ("CartPole-v1", "sync", None),
+        ("CartPole-v1", "async", None),
+        ("Hopper-v5", "sync", "mujoco"),
+        ("HalfCheetah-v5", "async", "mujoco"),
+        ("LunarLanderContinuous-v3", "sync", "Box2D"),
+    ],
+)
+def test_going_back_to_a_state_goes_on_to_the_last_bit(
+    env_id: str, vectorization: str, module: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    if module is not None:
+        pytest.importorskip(module)
+    with (
+        closing(make(env_id, 2, vectorization=vectorization)) as env,
+        closing(make(env_id, 2, vectorization=vectorization)) as other,
+    ):
+        actions = actions_for(env, 300)
+        last, _ = env.reset()
+        for now in actions[:150]:
+            last = env.step(now)[0]
+        loaded = other.load_state_dict(env.state_dict())
+        assert all(np.array_equal(values, last[name]) for name, values in loaded.items())
+        for now in actions[150:]:
+            assert_same(env.step(now), other.step(now))
+        assert_same(env.state_dict(), other.state_dict())
+    assert not caplog.records
+
+
+def assert_same(one: Any, other: Any) -> None:
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        one, other = list(one.values()), list(other.values())
+    if isinstance(one, (list, tuple)):
+        for part, counterpart in zip(one, other, strict=True):
+            assert_same(part, counterpart)
+    else:
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_state_holds_no_more_actions_than_the_longest_running_episode() -> None:
+    env = make()
+    env.reset()
+    for actions in actions_for(env, 50):
+        env.step(actions)
+        state = env.state_dict()
+        assert len(state["actions"]) == state["lengths"].max() < ROOM_STEPS
+
+
+def test_a_state_is_not_changed_by_what_follows() -> None:
+    env = make()
+    env.reset()
+    actions = actions_for(env, 30)
+    for now in actions[:15]:
+        env.step(now)
+    state = env.state_dict()
+    first = [env.step(now) for now in actions[15:]]
+    env.load_state_dict(state)
+    assert_same(first, [env.step(now) for now in actions[15:]])
+
+
+def test_an_environment_that_can_not_be_played_again_is_told(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    env = make(kwargs={"trouble": "forgetful"})
+    env.reset()
+    env.load_state_dict(env.state_dict())
+    assert "'ventosa_tests/Room-v0' did not come back to where it was" in caplog.text
+
+
+# -- settings -------------------------------------------------------------------------------------
+
+
+def test_settings_reach_the_environment() -> None:
+    env = make("Pendulum-v1", 2, kwargs={"g": 0.0}, max_episode_steps=5)
+    env.reset()
+    ends = [env.step(np.zeros((2, 1), np.float32))[3].all() for _ in range(10)]
+    assert ends == [False] * 4 + [True] + [False] * 4 + [True]
+    assert env.single_action_space == Box(-2.0, 2.0, (1,), np.float32)
+
+
+def test_any_observation_can_be_flattened() -> None:
+    env = make("Blackjack-v1", 2, flatten_observations=True)
+    assert env.single_observation_space["observation"].shape == (32 + 11 + 2,)
+    assert env.observation_space.contains(env.reset()[0])
+
+
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"id": "Pendulm-v1"}, r"^id: .* no environment 'Pendulm-v1'; did you mean 'Pendulum-v1'"),
+        ({"id": "CartPole-v9"}, r"no environment 'CartPole-v9'; did you mean 'CartPole-v1'"),
+        ({"id": "ALE/Breakout-v5"}, r"no environment 'ALE/Breakout-v5'; .*MODULE:ID"),
+        ({"id": "no_such_module:Env-v0"}, r"lacks a package: No module named 'no_such_module'"),
+        ({"id": "two words"}, r"'two words' can't be made: .*Malformed environment ID"),
+        (
+            {"id": "Pendulum-v1", "kwargs": {"gravity": 1}},
+            r"'Pendulum-v1' can't be made with kwargs \{'gravity': 1\}: .*argument 'gravity'",
+        ),
+        ({"id": "Blackjack-v1"}, r"no encoder takes the space Tuple.*flatten_observations: true"),
+    ],
+)
+def test_what_can_not_be_made_is_the_users_mistake(
+    settings: dict[str, Any], message: str, vectorization: Any
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        GymEnvironment(GymSettings(vectorization=vectorization, **settings), [])
+
+
+@pytest.mark.parametrize(
+    ("env_id", "module", "missing", "extra"),
+    [
+        ("Hopper-v5", "gymnasium.envs.mujoco.mujoco_env", "mujoco", "mujoco"),
+        ("LunarLander-v3", "gymnasium.envs.box2d.lunar_lander", "Box2D", "box2d"),
+    ],
+)
+def test_a_missing_package_is_named_with_what_installs_it(
+    monkeypatch: pytest.MonkeyPatch, env_id: str, module: str, missing: str, extra: str
+) -> None:
+    package = module.rpartition(".")[0]
+    for name in list(sys.modules):
+        if name.startswith(package) or name.partition(".")[0] == missing:
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(ValueError, match=rf"'{env_id}' lacks a package.*'ventosa\[{extra}\]'"):
+        make(env_id)
+
+
+def test_rewards_of_the_run_file_are_refused() -> None:
+    terms = [RewardTerm("touch", 1.0, lambda transition: np.zeros(1))]
+    with pytest.raises(ValueError, match=r"'CartPole-v1' has its own rewards.*\(touch\).*leave"):
+        GymEnvironment(GymSettings(id="CartPole-v1"), terms)
+
+
+# -- failures -------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning:gymnasium.vector")
+@pytest.mark.parametrize(
+    ("vectorization", "trouble", "message"),
+    [
+        ("sync", "error", "Room-v0' failed: RuntimeError: the room collapsed"),
+        ("async", "error", "Room-v0' failed: RuntimeError: the room collapsed"),
+        ("async", "death", "Room-v0' failed: one of its processes died"),
+    ],
+)
+def test_an_environment_that_breaks_down_is_named_and_can_be_closed(
+    vectorization: str, trouble: str, message: str
+) -> None:
+    env = make(vectorization=vectorization, kwargs={"trouble": trouble})
+    env.reset()
+    actions = actions_for(env, 2)
+    env.step(actions[0])
+    with pytest.raises(EnvironmentFailure, match=message):
+        env.step(actions[1])
+    env.close()
+    processes = getattr(env._vector, "processes", ())
+    assert not any(process.is_alive() for process in processes)
+
+
+def test_processes_leave_ctrl_c_to_the_learner() -> None:
+    with closing(make(vectorization="async")) as env:
+        env.reset()
+        for process in env._vector.processes:  # type: ignore[union-attr]
+            os.kill(process.pid, signal.SIGINT)
+        for actions in actions_for(env, 3):
+            env.step(actions)

@@ -1,0 +1,140 @@
+"""What an evaluation says of a policy, whatever the environment reports."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.spaces import Box
+
+from trainers.checkpoint import Checkpoints
+from trainers.evaluate import main
+from trainers.plugins import Registries
+from trainers.results import begin
+from trainers.session import Session
+from trainers.settings import RunSettings
+
+LENGTHS = (2, 4)
+GYMNASIUM = {"type": "gymnasium", "id": "ventosa_tests/Square-v0", "num_envs": 2}
+GRASP = {
+    "type": "grasp",
+    "num_envs": 2,
+    "workers": 0,
+    "episode_steps": 3,
+    "cameras": {"depth": {"type": "depth", "width": 36, "height": 36}},
+}
+
+
+class Square(gymnasium.Env[Any, Any]):
+    """Every step is worth the square of its action; episodes have one of two lengths."""
+
+    observation_space = Box(-1.0, 1.0, (1,), np.float32)
+    action_space = Box(-4.0, 4.0, (1,), np.float32)
+    seeds: list[int] = []  # noqa: RUF012
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        assert seed is not None
+        self.seeds.append(seed)
+        self.left = LENGTHS[self.np_random.integers(2)]
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.left -= 1
+        return np.zeros(1, np.float32), float(action[0]) ** 2, self.left == 0, False, {}
+
+
+@pytest.fixture(autouse=True)
+def registered() -> Iterator[None]:
+    gymnasium.register("ventosa_tests/Square-v0", entry_point=Square)
+    yield
+    del gymnasium.registry["ventosa_tests/Square-v0"]
+
+
+@pytest.fixture
+def saved(
+    tmp_path: Path, make_run: Callable[..., RunSettings], registries: Registries
+) -> Callable[..., Path]:
+    """Saves a run whose policy's best action is always 3, give or take its deviation of 1."""
+
+    def save(environment: Any, **rest: Any) -> Path:
+        run = make_run(environment, **rest)
+        session = Session(run, registries)
+        weights = session.weights()
+        weights["action_head.weight"].zero_()
+        weights["action_head.bias"].fill_(3.0)
+        session.close()
+        begin(tmp_path / "run", run, resume=False)
+        Checkpoints(tmp_path / "run/checkpoints", keep=1).save(1, weights, {}, None)
+        return tmp_path / "run"
+
+    return save
+
+
+def report(run: Path, *arguments: str) -> dict[str, Any]:
+    path = run.parent / "evaluation.json"
+    assert main([str(run), "--json", str(path), *arguments]) == 0
+    said: dict[str, Any] = json.loads(path.read_text())
+    return said
+
+
+def test_episodes_of_gymnasium_are_played_by_the_deterministic_policy(
+    saved: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = report(saved(GYMNASIUM), "--episodes", "30")
+    assert said.keys() == {"episodes", "seed", "reward", "reward_std", "episode_length"}
+    assert said["episodes"] == 30
+    length = said["episode_length"]
+    assert 2 < length < 4
+    assert said["reward"] == pytest.approx(9 * length)
+    # Of a number that is a with probability p and b else: |a - b| sqrt(p (1 - p)).
+    share = (length - 2) / 2
+    assert said["reward_std"] == pytest.approx(18 * (share * (1 - share)) ** 0.5)
+    printed = capsys.readouterr().out
+    for fact in (f"{said['reward']:.3f}", "reward std", f"{said['reward_std']:.3f}", "30 episodes"):
+        assert fact in printed
+
+
+def test_episodes_are_repeatable_and_their_seeds_are_not_the_runs(
+    saved: Callable[..., Path], make_session: Callable[..., Session]
+) -> None:
+    Square.seeds.clear()
+    make_session(GYMNASIUM).close()
+    run = saved(GYMNASIUM)
+    trained = set(Square.seeds)
+    evaluated = []
+    for arguments in ([], [], ["--seed", "1"]):
+        Square.seeds.clear()
+        report(run, "--episodes", "10", *arguments)
+        evaluated.append(set(Square.seeds))
+    assert trained
+    assert evaluated[0] == evaluated[1]
+    assert evaluated[0].isdisjoint(trained | evaluated[2])
+
+
+def test_the_environment_says_how_many_episodes_it_is_judged_by(
+    saved: Callable[..., Path],
+) -> None:
+    assert report(saved(GYMNASIUM))["episodes"] == 100
+
+
+def test_grasping_is_judged_by_the_first_action_and_by_episodes_as_in_training(
+    saved: Callable[..., Path],
+) -> None:
+    rewards = [{"type": "approach"}, {"type": "facing"}]
+    encoders = {"depth": {"type": "paper", "size": 32}}
+    said = report(saved(GRASP, rewards=rewards, encoders=encoders), "--episodes", "3")
+    assert said.keys() >= {"first_action_success", "position_error_m", "yaw_error_deg", "success"}
+    assert said.keys() >= {"reward", "reward_std", "episode_length", "collision_rate"}
+
+
+def test_a_setting_that_the_environment_lacks_is_the_users_mistake(
+    saved: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(saved(GYMNASIUM)), "--simulator", "fast"]) == 2
+    assert "environment.simulator: unknown key" in capsys.readouterr().err
