@@ -145,7 +145,7 @@ def test_a_stop_before_the_first_step_can_be_taken_up_too(
     [
         ("ppo", "shared", {"beta_schedule": "constant"}),
         ("ppo", "separate", {"beta_schedule": "constant"}),
-        ("trpo", "separate", {"fisher_fraction": 0.5}),
+        ("trpo", "separate", {"fisher_fraction": 0.5, "normalize_rewards": True}),
     ],
 )
 def test_two_halves_make_the_same_whole(
