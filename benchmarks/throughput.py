@@ -2,7 +2,8 @@
 
 Simulators and environments are compared with PyBullet's, the training loop with Stable-Baselines3's
 PPO on the same environment. All are measured in turn in one run: the median over the rounds counts,
-and the slowest and the fastest round are shown beside it.
+and the slowest and the fastest round are shown beside it. All of it takes about an hour, most of
+which is training on the largest images; `--sizes 80` takes minutes.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import importlib.util
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 PARTS = ("simulator", "environment", "training", "memory")
 SIZES = (32, 80, 128, 256)
-PEER = "stable_baselines3"
+PEER_PACKAGE = "stable_baselines3"
 INSTALL = "pip install -c constraints.txt -e '.[bench]'"
 MISTAKE = 2
 # A batch is 512 transitions, and there are 32 of each environment in a buffer.
@@ -37,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.picture is not None and not installed("matplotlib"):
         print(f"error: --picture needs matplotlib; install it with: {INSTALL}", file=sys.stderr)
         return MISTAKE
-    if not installed(PEER) and {"training", "memory"} & set(options.parts):
+    if not installed(PEER_PACKAGE) and {"training", "memory"} & set(options.parts):
         console.print(
             "stable-baselines3 is not installed, so training is measured without it; "
             f"to compare: {INSTALL}",
@@ -83,7 +84,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--train-envs", type=int, default=256, metavar="N", help="environments to train on"
     )
-    parser.add_argument("--repeats", type=int, default=5, help="rounds, of which the median counts")
+    parser.add_argument("--repeats", type=int, default=3, help="rounds, of which the median counts")
     parser.add_argument("--seconds", type=float, default=2.0, help="of a measurement, at least")
     parser.add_argument(
         "--quick", action="store_true", help="two small sizes and three short rounds, unless given"
@@ -113,7 +114,9 @@ def _simulator(options: argparse.Namespace, report: Report, console: Console) ->
     from benchmarks.speed.simulators import measure  # noqa: PLC0415
     from benchmarks.speed.tables import comparison  # noqa: PLC0415
 
-    figures = measure(options.sizes, options.num_worlds, options.repeats, options.seconds)
+    figures = []
+    for size in _announced("simulators", options.sizes, console):
+        figures += measure(size, options.num_worlds, options.repeats, options.seconds)
     report.figures += figures
     console.print(comparison(f"simulators, {_cores(report)}", figures))
 
@@ -123,7 +126,9 @@ def _environment(options: argparse.Namespace, report: Report, console: Console) 
     from benchmarks.speed.figures import FAST, growth  # noqa: PLC0415
     from benchmarks.speed.tables import comparison, growth_table  # noqa: PLC0415
 
-    figures = measure(options.sizes, options.num_envs, options.repeats, options.seconds)
+    figures = []
+    for size in _announced("environments", options.sizes, console):
+        figures += measure(size, options.num_envs, options.repeats, options.seconds)
     report.figures += figures
     report.growth = growth([figure for figure in figures if figure.contender == FAST])
     console.print(comparison(f"environments, random actions, {_cores(report)}", figures))
@@ -136,28 +141,28 @@ def _training(options: argparse.Namespace, report: Report, console: Console) -> 
     from benchmarks.speed.tables import comparison  # noqa: PLC0415
     from benchmarks.speed.training import contenders, measure  # noqa: PLC0415
 
-    setup = Setup(num_envs=options.train_envs)
-    figures, report.parameters = measure(
-        options.sizes, setup, options.repeats, options.seconds, contenders(installed(PEER))
-    )
-    report.figures += figures
-    counts = ", ".join(f"{size}x{size}: {n:,}" for size, n in report.parameters.items())
-    title = f"PPO on the same environment, {_cores(report)}, torch threads: "
-    console.print(
-        comparison(
-            title + str(report.machine["torch_threads"]), figures, f"parameters of each: {counts}"
+    figures = []
+    for size in _announced("training", options.sizes, console):
+        setup = Setup(size=size, num_envs=options.train_envs)
+        found, report.parameters[size] = measure(
+            setup, options.repeats, options.seconds, contenders(installed(PEER_PACKAGE))
         )
-    )
+        figures += found
+    report.figures += figures
+    title = f"PPO on the same environment, {_cores(report)}, {_threads(report)}"
+    counts = ", ".join(f"{size}x{size}: {n:,}" for size, n in report.parameters.items())
+    console.print(comparison(title, figures, f"parameters of each network: {counts}"))
 
 
 def _memory(options: argparse.Namespace, report: Report, console: Console) -> None:
+    from benchmarks.speed.figures import OURS, PEER  # noqa: PLC0415
     from benchmarks.speed.processes import footprints, start_s  # noqa: PLC0415
     from benchmarks.speed.setup import Setup  # noqa: PLC0415
     from benchmarks.speed.tables import memory_table  # noqa: PLC0415
-    from benchmarks.speed.training import contenders  # noqa: PLC0415
 
-    setup = Setup(num_envs=options.train_envs)
-    report.memory = footprints(options.sizes, setup, list(contenders(installed(PEER))))
+    names = [OURS, PEER] if installed(PEER_PACKAGE) else [OURS]
+    for size in _announced("memory", options.sizes, console):
+        report.memory += footprints(Setup(size=size, num_envs=options.train_envs), names)
     report.start_s = start_s()
     console.print(memory_table(report.memory, report.start_s))
 
@@ -168,6 +173,18 @@ MEASURES = {
     "training": _training,
     "memory": _memory,
 }
+
+
+def _announced(what: str, sizes: Sequence[int], console: Console) -> Iterator[int]:
+    """The sizes, each shown on a terminal while it is measured."""
+    with console.status("") as status:
+        for size in sizes:
+            status.update(f"measuring {what} at {size}x{size}")
+            yield size
+
+
+def _threads(report: Report) -> str:
+    return f"{report.machine['torch_threads']} torch threads"
 
 
 def _cores(report: Report) -> str:

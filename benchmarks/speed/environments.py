@@ -22,27 +22,24 @@ Team = tuple[str, int]
 """A simulator and a number of environments."""
 
 
-def measure(
-    sizes: Sequence[int], num_envs: Sequence[int], repeats: int, seconds: float
-) -> list[Figure]:
+def measure(size: int, num_envs: Sequence[int], repeats: int, seconds: float) -> list[Figure]:
     """Measures `fast` with each number of environments, and PyBullet with the first.
 
     Args:
-        sizes: sides of the images in pixels.
+        size: side of the images in pixels.
         num_envs: how many environments are stepped together.
         repeats: rounds.
         seconds: of each measurement.
     """
     figures = []
-    for size in sizes:
-        for mode in MODES:
-            first, *more = num_envs
-            teams = [(FAST, first), (PYBULLET, first), *((FAST, n) for n in more)]
-            found = _race(size, mode, teams, repeats, seconds)
-            figures += [
-                Figure(Case(WHAT, size, mode, n), simulator, Samples(tuple(rates)))
-                for (simulator, n), rates in found.items()
-            ]
+    for mode in MODES:
+        first, *more = num_envs
+        teams = [(FAST, first), (PYBULLET, first), *((FAST, n) for n in more)]
+        found = _race(size, mode, teams, repeats, seconds)
+        figures += [
+            Figure(Case(WHAT, size, mode, n), simulator, Samples(tuple(rates)))
+            for (simulator, n), rates in found.items()
+        ]
     return figures
 
 

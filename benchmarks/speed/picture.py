@@ -8,9 +8,10 @@ from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure as Canvas
-from matplotlib.ticker import FuncFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from benchmarks.speed.figures import FAST, OURS, PEER, PYBULLET, Figure
+from trainers.progress import format_count
 
 COLORS = {OURS: "#0b6e4f", FAST: "#0b6e4f", PEER: "#c8553d", PYBULLET: "#c8553d"}
 LEFT_OUT = ("collection steps", "update steps")
@@ -62,43 +63,40 @@ def _panels(figures: Iterable[Figure]) -> dict[str, dict[str, list[Figure]]]:
 
 
 def _panel(axes: Any, title: str, lines: dict[str, list[Figure]]) -> None:
+    fastest_first = sorted(lines, key=lambda name: -lines[name][-1].samples.median)
+    for place, name in enumerate(fastest_first):
+        _line(axes, name, lines[name], above=place == 0)
     sizes = sorted({figure.case.size for line in lines.values() for figure in line})
-    for name, line in lines.items():
-        x = [figure.case.size for figure in line]
-        middle = [figure.samples.median for figure in line]
-        low = [figure.samples.low for figure in line]
-        high = [figure.samples.high for figure in line]
-        axes.plot(x, middle, marker="o", markersize=4, color=COLORS[name])
-        axes.fill_between(x, low, high, color=COLORS[name], alpha=0.2, linewidth=0)
-        for across, up in zip(x, middle, strict=True):
-            axes.annotate(
-                _short(up, None),
-                (across, up),
-                xytext=(0, 5),
-                textcoords="offset points",
-                ha="center",
-                fontsize=7,
-                color=COLORS[name],
-            )
-        axes.annotate(
-            name,
-            (x[-1], middle[-1]),
-            xytext=(12, 0),
-            textcoords="offset points",
-            va="center",
-            weight="bold",
-            color=COLORS[name],
-        )
     axes.set(title=title, xscale="log", yscale="log", xlabel="side of the images, pixels")
     axes.set_xlim(sizes[0] / 1.15, sizes[-1] * ROOM_FOR_LABELS)
     axes.set_xticks(sizes, [str(size) for size in sizes])
+    axes.margins(y=0.15)
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_major_formatter(FuncFormatter(_short))
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: format_count(value)))
     axes.yaxis.set_minor_locator(NullLocator())
 
 
-def _short(value: float, _: object) -> str:
-    """`870`, `1.2k`, `45k`."""
-    if value < 1e3:
-        return f"{value:.0f}"
-    return f"{value / 1e3:.1f}k" if value < 1e4 else f"{value / 1e3:.0f}k"
+def _line(axes: Any, name: str, line: list[Figure], *, above: bool) -> None:
+    """One contender: medians, the range of all rounds behind them, and its name at the end."""
+    color, x = COLORS[name], [figure.case.size for figure in line]
+    samples = [figure.samples for figure in line]
+    axes.plot(x, [one.median for one in samples], marker="o", markersize=4, color=color)
+    low, high = [one.low for one in samples], [one.high for one in samples]
+    axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
+    for across, one in zip(x, samples, strict=True):
+        label = {"xytext": (0, 5 if above else -12), "ha": "center", "fontsize": 7}
+        _note(axes, format_count(one.median), (across, one.median), color=color, **label)
+    _note(
+        axes,
+        name,
+        (x[-1], samples[-1].median),
+        color=color,
+        xytext=(12, 0),
+        va="center",
+        weight="bold",
+    )
+
+
+def _note(axes: Any, text: str, place: tuple[float, float], **style: Any) -> None:
+    axes.annotate(text, place, textcoords="offset points", **style)

@@ -10,10 +10,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.speed.figures import MODES
+from benchmarks.speed.figures import MODES, OURS
 from benchmarks.speed.setup import Setup
 
 REPOSITORY = Path(__file__).parents[2]
@@ -40,19 +40,14 @@ class Footprint:
 
 
 def footprints(
-    sizes: Sequence[int],
-    setup: Setup,
-    contenders: Sequence[str],
-    modes: Iterable[str] = tuple(MODES),
+    setup: Setup, contenders: Sequence[str], modes: Iterable[str] = tuple(MODES)
 ) -> list[Footprint]:
     """Measures the peak resident set of each contender, over `BUFFERS` buffers."""
     found = []
-    for size in sizes:
-        for mode in modes:
-            for name in contenders:
-                run = setup.with_images(size, mode)
-                peak_mib = _ask("learn", name, str(size), mode, str(run.num_envs))
-                found.append(Footprint(name, size, mode, peak_mib))
+    for mode in modes:
+        for name in contenders:
+            peak_mib = _ask("learn", name, str(setup.size), mode, str(setup.num_envs))
+            found.append(Footprint(name, setup.size, mode, peak_mib))
     return found
 
 
@@ -86,9 +81,10 @@ def _learn(name: str, size: int, mode: str, num_envs: int) -> float:
     # Each process loads its own contender alone.
     from benchmarks.speed.training import contenders  # noqa: PLC0415
 
-    setup = replace(Setup(num_envs=num_envs), size=size, mode=mode)
-    contender = contenders(peer=True)[name](setup)
-    contender.learn(BUFFERS)
+    setup = Setup(size=size, mode=mode, num_envs=num_envs)
+    contender = contenders(peer=name != OURS)[name](setup)
+    for _ in range(BUFFERS):
+        contender.learn()
     contender.close()
     # Not getrusage's ru_maxrss, which begins with the parent's: this one begins at exec.
     status = Path("/proc/self/status").read_text()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from benchmarks.speed.figures import FRAME_GRAB, MODES
@@ -50,10 +50,6 @@ class Setup:
     def buffer_size(self) -> int:
         """Transitions collected before an update."""
         return self.num_envs * self.num_steps
-
-    def with_images(self, size: int, mode: str) -> Setup:
-        """The same with other images."""
-        return replace(self, size=size, mode=mode)
 
     def environment(self) -> dict[str, Any]:
         """Settings of the grasp environment; `uint8` is what Stable-Baselines3 scales itself."""

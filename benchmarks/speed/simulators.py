@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 
@@ -20,30 +19,28 @@ from envs.grasp.simulators.factory import make_simulator
 WHATS = {"depth": "depth frames", "rgb": "color frames"}
 
 
-def measure(sizes: Sequence[int], num_worlds: int, repeats: int, seconds: float) -> list[Figure]:
+def measure(size: int, num_worlds: int, repeats: int, seconds: float) -> list[Figure]:
     """Measures both simulators, on all cores.
 
     Args:
-        sizes: sides of the images in pixels.
+        size: side of the images in pixels.
         num_worlds: taken at once.
         repeats: rounds.
         seconds: of each measurement.
     """
     figures = []
-    for size in sizes:
-        for kind, what in WHATS.items():
-            case = Case(what, size, "", num_worlds)
-            with ExitStack() as stack:
-                sets = {name: _Set(name, kind, size, num_worlds) for name in (FAST, PYBULLET)}
-                for one in sets.values():
-                    stack.callback(one.simulator.close)
-                    rate(one.shoot, 0.0, one.change)  # compiles, and starts processes
-                measures = {
-                    name: partial(rate, one.shoot, seconds, one.change)
-                    for name, one in sets.items()
-                }
-                found = interleave(measures, repeats)
-            figures += [Figure(case, name, Samples(tuple(rates))) for name, rates in found.items()]
+    for kind, what in WHATS.items():
+        case = Case(what, size, "", num_worlds)
+        with ExitStack() as stack:
+            sets = {name: _Set(name, kind, size, num_worlds) for name in (FAST, PYBULLET)}
+            for one in sets.values():
+                stack.callback(one.simulator.close)
+                rate(one.shoot, 0.0, one.change)  # compiles, and starts processes
+            measures = {
+                name: partial(rate, one.shoot, seconds, one.change) for name, one in sets.items()
+            }
+            found = interleave(measures, repeats)
+        figures += [Figure(case, name, Samples(tuple(rates))) for name, rates in found.items()]
     return figures
 
 

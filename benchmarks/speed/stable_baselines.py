@@ -50,9 +50,9 @@ class StableBaselines:
         )
         self.parameters = sum(parameter.numel() for parameter in self._ppo.policy.parameters())
 
-    def learn(self, buffers: int) -> None:
+    def learn(self) -> None:
         """See `benchmarks.speed.training.Contender`."""
-        self._ppo.learn(buffers * self._buffer_size, reset_num_timesteps=False)
+        self._ppo.learn(self._buffer_size, reset_num_timesteps=False)
 
     def close(self) -> None:
         """See `benchmarks.speed.training.Contender`."""

@@ -5,10 +5,9 @@ Both act in the same batched environment, with the same network, hyper-parameter
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from typing import Protocol
 
@@ -35,8 +34,8 @@ class Contender(Protocol):
 
     parameters: int
 
-    def learn(self, buffers: int) -> None:
-        """Trains on so many buffers, and times `collect` and `update` as parts."""
+    def learn(self) -> None:
+        """Fills one buffer and learns from it; times `collect` and `update` as parts."""
 
     def close(self) -> None:
         """Ends the environments."""
@@ -54,46 +53,44 @@ def contenders(peer: bool) -> dict[str, Callable[[Setup], Contender]]:
 
 
 def measure(
-    sizes: Sequence[int],
     setup: Setup,
     repeats: int,
     seconds: float,
     makers: Mapping[str, Callable[[Setup], Contender]],
-) -> tuple[list[Figure], dict[int, int]]:
+) -> tuple[list[Figure], int]:
     """Measures the training loops.
 
     Args:
-        sizes: sides of the images in pixels.
-        setup: everything else that both have in common.
+        setup: what all have in common; the mode is set here.
         repeats: rounds.
         seconds: of each measurement, rounded up to whole buffers.
         makers: build the contenders.
 
     Returns:
-        The figures; and, by size, how many parameters the networks of both have.
+        The figures; and how many parameters the networks have.
 
     Raises:
-        RuntimeError: they differ in that.
+        RuntimeError: the contenders differ in that.
     """
-    figures, parameters = [], {}
-    for size in sizes:
-        for mode in MODES:
-            with ExitStack() as stack:
-                teams = {}
-                for name, make in makers.items():
-                    teams[name] = make(setup.with_images(size, mode))
-                    stack.callback(teams[name].close)
-                parameters[size] = _common_parameters(teams)
-                measures = {
-                    name: partial(_speeds, one, setup.buffer_size, _buffers(one, seconds))
-                    for name, one in teams.items()
-                }
-                found = interleave(measures, repeats)
-            for name, rounds in found.items():
-                for what in WHATS:
-                    case = Case(what, size, mode, setup.num_envs)
-                    values = tuple(speeds[what] for speeds in rounds)
-                    figures.append(Figure(case, name, Samples(values)))
+    figures, parameters = [], 0
+    for mode in MODES:
+        with ExitStack() as stack:
+            teams = {}
+            for name, make in makers.items():
+                teams[name] = make(replace(setup, mode=mode))
+                stack.callback(teams[name].close)
+            parameters = _common_parameters(teams)
+            for team in teams.values():
+                team.learn()  # compiles, and takes what memory it needs
+            measures = {
+                name: partial(_speeds, team, setup.buffer_size, seconds)
+                for name, team in teams.items()
+            }
+            found = interleave(measures, repeats)
+        for name, rounds in found.items():
+            for what in WHATS:
+                case = Case(what, setup.size, mode, setup.num_envs)
+                figures.append(Figure(case, name, Samples(tuple(one[what] for one in rounds))))
     return figures, parameters
 
 
@@ -104,20 +101,13 @@ def _common_parameters(teams: Mapping[str, Contender]) -> int:
     return next(iter(counts.values()))
 
 
-def _buffers(contender: Contender, seconds: float) -> int:
-    """How many buffers fill a measurement, after one to compile and to settle."""
-    contender.learn(1)
-    start_s = time.perf_counter()
-    contender.learn(1)
-    return math.ceil(seconds / (time.perf_counter() - start_s))
-
-
-def _speeds(contender: Contender, buffer_size: int, buffers: int) -> dict[str, float]:
+def _speeds(contender: Contender, buffer_size: int, seconds: float) -> dict[str, float]:
     """Steps per second of the whole loop and its two parts."""
-    root = Timer()
-    with recording(root):
-        contender.learn(buffers)
-    steps = buffers * buffer_size
+    root, steps = Timer(), 0
+    while root.total_s < seconds:
+        with recording(root):
+            contender.learn()
+        steps += buffer_size
     return {
         what: steps / (root if part is None else root.children[part]).total_s
         for what, part in WHATS.items()

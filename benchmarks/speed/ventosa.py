@@ -50,9 +50,9 @@ class Ventosa:
         policy = self._session.algorithm.policy
         self.parameters = sum(parameter.numel() for parameter in policy.parameters())
 
-    def learn(self, buffers: int) -> None:
+    def learn(self) -> None:
         """See `Contender`."""
-        steps = self._session.interaction.step_count + buffers * self._buffer_size
+        steps = self._session.interaction.step_count + self._buffer_size
         settings = self._settings.model_copy(update={"max_steps": steps})
         train(self._session, settings, self._summary, self._checkpoints, self._progress)
 
