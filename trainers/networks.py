@@ -34,6 +34,11 @@ class NetworkSettings(BaseModel, frozen=True, extra="forbid"):
     activation: Literal["relu", "tanh", "silu", "elu"] = Field(
         "relu", description="Activation of the hidden layers."
     )
+    precision: Literal["float32", "bfloat16"] = Field(
+        "float32",
+        description="Numbers that encoders and hidden layers calculate with; bfloat16 is faster "
+        "where the processor knows it. Weights, memory, heads and losses are always float32.",
+    )
     normalize: bool = Field(
         False, description="Standardise vector observations whose encoder is not set otherwise."
     )
@@ -77,6 +82,7 @@ class Network(nn.Module):
         )
         width = sum(cast(int, encoder.features_dim) for encoder in encoders.values())
         self.trunk, width = hidden_layers(width, settings)
+        self._lowered = settings.precision == "bfloat16"
         self.memory = None if memory is None else Recurrent(width, memory)
         self.features_dim = width if self.memory is None else self.memory.features_dim
         self.state_size = 0 if self.memory is None else self.memory.state_size
@@ -89,9 +95,10 @@ class Network(nn.Module):
         """
         if not self.frame_encoders:
             return None
-        parts = [encoder(frames[name]) for name, encoder in self.frame_encoders.items()]
-        features = torch.cat(parts, dim=1)
-        return features if self.vector_encoders else self.trunk(features)
+        with self._precision(next(iter(frames.values())).device):
+            parts = [encoder(frames[name]) for name, encoder in self.frame_encoders.items()]
+            features = torch.cat(parts, dim=1)
+            return (features if self.vector_encoders else self.trunk(features)).float()
 
     def forward(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
         """Hidden vectors (B, features_dim) alone; see `recall`."""
@@ -128,9 +135,12 @@ class Network(nn.Module):
         if not self.vector_encoders:
             return parts[0]
         vectors = observations.vectors
-        parts += [encoder(vectors[name]) for name, encoder in self.vector_encoders.items()]
-        hidden: Tensor = self.trunk(torch.cat(parts, dim=1))
-        return hidden
+        with self._precision(next(iter(vectors.values())).device):
+            parts += [encoder(vectors[name]) for name, encoder in self.vector_encoders.items()]
+            return self.trunk(torch.cat(parts, dim=1)).float()
+
+    def _precision(self, device: torch.device) -> torch.autocast:
+        return torch.autocast(device.type, torch.bfloat16, enabled=self._lowered)
 
     def update_statistics(self, vectors: Mapping[str, Tensor]) -> None:
         """Shows vectors (B, n) to the encoders that standardise."""
