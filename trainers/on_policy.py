@@ -183,7 +183,7 @@ class _Frames:
             self.new = np.arange(self._count)
         if len(self.new):
             self._index[self.new] = self._store.add(raw, self.new)
-            with timed("encode"):
+            if self.names:
                 self._encode(raw)
         return torch.from_numpy(self._index.copy()).to(self._device), self._features
 
@@ -193,7 +193,9 @@ class _Frames:
 
     def _encode(self, raw: Mapping[str, NDArray[Any]]) -> None:
         frames = {name: raw[name] for name in self.names}
-        fresh = self._policy.encode_frames(to_tensors(frames, self._space, self._device, self.new))
+        with timed("encode"):
+            seen = to_tensors(frames, self._space, self._device, self.new)
+            fresh = self._policy.encode_frames(seen)
         if len(self.new) < self._count:
             rows = torch.from_numpy(self.new).to(self._device)
             fresh = self._features.with_rows(rows, fresh)
