@@ -231,7 +231,7 @@ class _Frames:
             self.new = np.arange(self._count)
         if len(self.new):
             self._index[self.new] = self._store.add(raw, self.new)
-            with timed("encode"):
+            if self.names:
                 self._encode()
         return torch.from_numpy(self._index.copy()).to(self._device)
 
@@ -245,7 +245,8 @@ class _Frames:
 
     def _encode(self) -> None:
         latest = self._store.tensors(self._store.count - len(self.new))
-        fresh = self._policy.encode_frames(Observations(latest, {}))
+        with timed("encode"):
+            fresh = self._policy.encode_frames(Observations(latest, {}))
         if len(self.new) < self._count:
             rows = torch.from_numpy(self.new).to(self._device)
             fresh = self.features.with_rows(rows, fresh)
