@@ -65,7 +65,11 @@ class Algorithm(Protocol):
         """
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything but the weights that is needed to go on exactly."""
+        """Everything but the weights that is needed to go on exactly.
+
+        It may share memory with what `collect` leaves alone, such as optimizers and a replay
+        buffer: a state from before a collection is saved where that is stopped half way.
+        """
 
     def load_state_dict(self, weights: dict[str, Tensor], state: dict[str, Any]) -> None:
         """Goes back to a state."""

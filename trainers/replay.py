@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from trainers.errors import UserError
 from trainers.interaction import Step
 from trainers.observations import Observations, frames_differ, is_frame
 
@@ -40,7 +41,7 @@ class ReplayBuffer:
         device: of the tensors that are handed out; the experience itself is in main memory.
 
     Raises:
-        ValueError: there is no room for that many.
+        UserError: there is no room for that many.
     """
 
     def __init__(
@@ -65,7 +66,10 @@ class ReplayBuffer:
             self._frames = _Slots(frames, 2 * size if frames else 0)
             self._finals = _Slots(vectors | {_FRAME: ((), np.dtype(np.int64))}, size)
         except MemoryError as error:
-            raise ValueError(f"no room for {capacity} transitions: {error}") from error
+            raise UserError(
+                f"trainer.hyperparameters.buffer_size: there is no room for {capacity} transitions "
+                f"({error}): lower it"
+            ) from error
         self._rewards = np.zeros(size, np.float32)
         self._terminated = np.zeros(size, bool)
         self._done = np.zeros(size, bool)

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from encoders.spaces import DepthImage
+from trainers.errors import UserError
 from trainers.interaction import Step
 from trainers.observations import Observations
 from trainers.replay import ReplayBuffer
@@ -188,8 +189,8 @@ def test_what_is_drawn_is_what_went_in(
             state = buffer.state_dict()
             buffer = ReplayBuffer(SPACE, 1, num_envs, steps * num_envs, CPU)
             elsewhere = World(num_envs, steps)
-            for other in moments[:number]:
-                elsewhere.step(buffer, other[::-1])
+            for _ in range(8):  # that takes more images than most
+                elsewhere.step(buffer, ["truncated"] * num_envs)
             buffer.load_state_dict(unflatten(*flatten(state)))
         world.step(buffer, events)
         check(buffer, world, gamma, n)
@@ -355,6 +356,11 @@ def test_an_end_without_its_last_observation_is_refused() -> None:
     x = {"x": np.zeros((1, 1), np.float32)}
     with pytest.raises(ValueError, match="no `final_obs`"):
         buffer.add(x, np.zeros((1, 1), np.float32), Step(np.zeros(1), no, cut, no, None), x)
+
+
+def test_a_buffer_larger_than_any_memory_is_the_users_mistake() -> None:
+    with pytest.raises(UserError, match=r"buffer_size: there is no room for 10{13} .*lower it$"):
+        ReplayBuffer(LINE, 1, 1, 10**13, CPU)
 
 
 def test_the_state_of_a_buffer_of_another_size_is_refused() -> None:
