@@ -10,11 +10,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.spaces import Box
+from torch import Tensor
 
 from trainers.checkpoint import Checkpoints
 from trainers.evaluate import main
+from trainers.observations import Observations
 from trainers.plugins import Registries
+from trainers.ppo import PPO
 from trainers.results import begin
 from trainers.session import Session
 from trainers.settings import RunSettings
@@ -115,6 +119,35 @@ def test_episodes_are_repeatable_and_their_seeds_are_not_the_runs(
     assert trained
     assert evaluated[0] == evaluated[1]
     assert evaluated[0].isdisjoint(trained | evaluated[2])
+
+
+def test_what_is_remembered_ends_with_its_episode(
+    saved: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ages: list[list[float]] = []
+
+    def count_steps(
+        algorithm: PPO, observations: Observations, *, deterministic: bool
+    ) -> tuple[Tensor, Tensor]:
+        assert observations.sequences is not None
+        state = observations.sequences.state
+        ages.append(state.flatten().tolist())
+        return torch.zeros(len(state), 1), state + 1.0
+
+    monkeypatch.setattr(PPO, "initial_state", lambda algorithm, count: torch.zeros(count, 1))
+    monkeypatch.setattr(PPO, "act", count_steps)
+    run = saved(GYMNASIUM)
+    ages.clear()
+    report(run, "--episodes", "40")
+    first_action, *steps = ages
+    assert first_action == [0.0, 0.0]
+    for column in np.array(steps).T:
+        begins = np.flatnonzero(column == 0.0)
+        lengths = np.diff(begins)
+        assert set(lengths) == set(LENGTHS)
+        np.testing.assert_array_equal(
+            column[: begins[-1]], np.concatenate([np.arange(length) for length in lengths])
+        )
 
 
 def test_the_environment_says_how_many_episodes_it_is_judged_by(
