@@ -123,7 +123,8 @@ def test_normalized_rewards_are_for_the_learner_alone(
     assert interaction.take_finished().rewards.tolist() == [8.0]
     other = OnPolicyCollector(policy, interaction, 2, generator, CPU, RewardNormalizer(1, 0.0))
     other.load_state_dict(collector.state_dict())
-    assert other.state_dict() == collector.state_dict()
+    normalizers = [c.state_dict()["reward_normalizer"] for c in (other, collector)]
+    assert normalizers[0] == normalizers[1]
 
 
 def test_an_end_that_is_both_counts_as_terminated(scripted: Any, make_factory: MakeFactory) -> None:
