@@ -13,7 +13,7 @@ from torch import Tensor
 
 from trainers.interaction import Interaction, Step
 from trainers.memory import Sequences, number_sequences
-from trainers.observations import Observations, to_tensors
+from trainers.observations import Observations, frames_differ, to_tensors
 from trainers.policy import ActorCritic, FrameFeatures, to_environment
 from trainers.returns import gae
 from trainers.reward_normalizer import RewardNormalizer
@@ -60,8 +60,8 @@ class OnPolicyCollector:
         """
         frames = _Frames(self._policy, self._interaction, self._steps, self._device)
         moments = [self._play(frames) for _ in range(self._steps)]
-        last_values = self._values(self._interaction.observations, self._remembered)
-        advantages, returns = self._estimate(moments, last_values, gamma, lambd)
+        last = self._tensors(self._interaction.observations, self._remembered)
+        advantages, returns = self._estimate(moments, self._policy.value(last), gamma, lambd)
         frame_index = torch.cat([moment.frame_index for moment in moments])
         return Rollout(
             frames=frames.tensors(),
@@ -96,12 +96,10 @@ class OnPolicyCollector:
     def _play(self, frames: _Frames) -> _Moment:
         """Acts once in every environment."""
         raw, state = self._interaction.observations, self._remembered
-        frame_index, features = frames.look(raw)
+        frame_index = frames.look(raw)
         with timed("act"):
-            vectors = {name: values for name, values in raw.items() if name not in frames.names}
-            observations = to_tensors(vectors, self._space, self._device)
-            observations = replace(observations, sequences=Sequences.single(state))
-            distribution, values, after = self._policy.step(observations, features)
+            observations = self._tensors(frames.without(raw), state)
+            distribution, values, after = self._policy.step(observations, frames.features)
             actions = distribution.sample(self._generator)
         step = self._interaction.step(to_environment(actions, self._action_space))
         frames.new = np.flatnonzero(~step.same_frame)
@@ -113,32 +111,43 @@ class OnPolicyCollector:
             actions=actions,
             log_probs=distribution.log_prob(actions),
             values=values,
-            final_values=self._final_values(step, after),
+            final_values=self._final_values(raw, frames, step, after),
             step=step,
         )
 
-    def _values(
+    def _tensors(
         self,
         raw: Mapping[str, NDArray[Any]],
         state: Tensor,
         rows: NDArray[np.int64] | None = None,
-    ) -> Tensor:
-        """Values of observations with what is remembered (B, m), in all environments or some."""
+    ) -> Observations:
+        """Observations in all environments or some, with what is remembered before them (B, m)."""
         observations = to_tensors(raw, self._space, self._device, rows)
-        return self._policy.value(replace(observations, sequences=Sequences.single(state)))
+        return replace(observations, sequences=Sequences.single(state))
 
-    def _final_values(self, step: Step, state: Tensor) -> Tensor:
+    def _final_values(
+        self, raw: Mapping[str, NDArray[Any]], frames: _Frames, step: Step, state: Tensor
+    ) -> Tensor:
         """Values (N,) of the last observations of episodes that were cut off; else zero.
 
         Args:
+            raw: what was observed before the step.
+            frames: with the features of that.
             step: what has just happened.
             state: (N, m) what is remembered after it.
         """
         values = torch.zeros(len(state), device=self._device)
-        numbers = np.flatnonzero(step.truncated)
-        if len(numbers) and step.final_observations is not None:
-            rows = self._tensor(numbers)
-            values[rows] = self._values(step.final_observations, state[rows], numbers)
+        cut, final = np.flatnonzero(step.truncated), step.final_observations
+        if not len(cut) or final is None:
+            return values
+        # With frame grab an episode's last image is its first, whose features are known.
+        differ = frames_differ(final, raw, frames.names, cut)
+        same, other = self._tensor(cut[~differ]), self._tensor(cut[differ])
+        if len(same):
+            vectors = self._tensors(frames.without(final), state[same], cut[~differ])
+            values[same] = self._policy.value(vectors, frames.features.rows(same))
+        if len(other):
+            values[other] = self._policy.value(self._tensors(final, state[other], cut[differ]))
         return values
 
     def _sequences(self, moments: list[_Moment]) -> Tensor:
@@ -197,6 +206,7 @@ class _Frames:
     Attributes:
         names: the observations that are frames.
         new: the environments whose frame has not been looked at yet.
+        features: of the frames in view.
     """
 
     def __init__(
@@ -209,11 +219,11 @@ class _Frames:
         self.names = frozenset(spaces)
         self._store = FrameStore(spaces, steps * self._count, device)
         self._index = np.zeros(self._count, np.int64)
-        self._features = FrameFeatures(None, None)
+        self.features = FrameFeatures(None, None)
         self.new = np.arange(self._count)
 
-    def look(self, raw: Mapping[str, NDArray[Any]]) -> tuple[Tensor, FrameFeatures]:
-        """Keeps and encodes the new frames; returns everyone's index (N,) and features.
+    def look(self, raw: Mapping[str, NDArray[Any]]) -> Tensor:
+        """Keeps and encodes the new frames; returns everyone's index (N,).
 
         Without cameras every observation counts as a frame of its own.
         """
@@ -223,7 +233,11 @@ class _Frames:
             self._index[self.new] = self._store.add(raw, self.new)
             with timed("encode"):
                 self._encode()
-        return torch.from_numpy(self._index.copy()).to(self._device), self._features
+        return torch.from_numpy(self._index.copy()).to(self._device)
+
+    def without(self, raw: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """The observations that are not frames."""
+        return {name: values for name, values in raw.items() if name not in self.names}
 
     def tensors(self) -> dict[str, Tensor]:
         """All frames by name, (U, H, W, C)."""
@@ -234,5 +248,5 @@ class _Frames:
         fresh = self._policy.encode_frames(Observations(latest, {}))
         if len(self.new) < self._count:
             rows = torch.from_numpy(self.new).to(self._device)
-            fresh = self._features.with_rows(rows, fresh)
-        self._features = fresh
+            fresh = self.features.with_rows(rows, fresh)
+        self.features = fresh

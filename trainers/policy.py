@@ -139,12 +139,13 @@ class ActorCritic(nn.Module):
         """The distribution of actions alone."""
         return self._distribution(self.actor(self._split(observations)[0]))
 
-    def value(self, observations: Observations) -> Tensor:
+    def value(self, observations: Observations, features: FrameFeatures | None = None) -> Tensor:
         """The values (B,) alone."""
+        known = features or FrameFeatures(None, None)
         seen_by_actor, seen_by_critic = self._split(observations)
         if self.critic is None:
-            return self._value(self.actor(seen_by_actor))
-        return self._value(self.critic(seen_by_critic))
+            return self._value(self.actor(seen_by_actor, known.actor))
+        return self._value(self.critic(seen_by_critic, known.critic))
 
     def encode_frames(self, observations: Observations) -> FrameFeatures:
         """What the encoders say of frames, to be reused as long as neither changes."""
@@ -198,6 +199,11 @@ class FrameFeatures:
 
     def __init__(self, actor: Tensor | None, critic: Tensor | None):
         self.actor, self.critic = actor, critic
+
+    def rows(self, rows: Tensor) -> FrameFeatures:
+        """Those of some rows."""
+        actor, critic = (None if f is None else f[rows] for f in (self.actor, self.critic))
+        return FrameFeatures(actor, critic)
 
     def with_rows(self, rows: Tensor, other: FrameFeatures) -> FrameFeatures:
         """These, with other features at some rows."""

@@ -92,12 +92,16 @@ class Rollout:
         Args:
             rows: (B,) in an order that `minibatches` or `in_groups` gives.
         """
-        frames, index = self.frame_index[rows].unique(return_inverse=True)
+        frames, index = self.frame_index[rows], None
+        distinct, place = frames.unique(return_inverse=True)
+        if len(distinct) < len(frames):
+            frames, index = distinct, place
         chosen = {name: take(tensor, frames) for name, tensor in self.frames.items()}
         vectors = {name: values[rows] for name, values in self.vectors.items()}
         _, lengths = self.groups[rows].unique_consecutive(return_counts=True)
         first = rows[lengths.cumsum(0) - lengths]
-        return Observations(chosen, vectors, index, Sequences(lengths.cpu(), self.states[first]))
+        sequences = Sequences(lengths.cpu(), self.states[first])
+        return Observations(chosen, vectors, index, sequences)
 
     def in_groups(self) -> Tensor:
         """All rows (M,), those of one group side by side and in the order of time."""

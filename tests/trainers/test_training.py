@@ -151,7 +151,7 @@ def test_a_stop_before_the_first_step_can_be_taken_up_too(
         ("ppo", "shared", None, {"beta_schedule": "constant"}),
         ("ppo", "separate", None, {"beta_schedule": "constant"}),
         ("ppo", "separate", {"memory_size": 4}, {"beta_schedule": "constant"}),
-        ("trpo", "separate", None, {"fisher_fraction": 0.5}),
+        ("trpo", "separate", None, {"fisher_fraction": 0.5, "normalize_rewards": True}),
     ],
 )
 def test_two_halves_make_the_same_whole(
