@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from envs.grasp.aims import Aims
 from envs.grasp.camera import Views
+from envs.grasp.pick import Outcome
 from envs.grasp.scene import Scenes
 from envs.grasp.settings import GraspSettings
 from envs.grasp.task import block_offset, goal_middle_m, yaw_error
@@ -62,9 +63,13 @@ class Shot:
     def caption(self) -> str:
         """How far the aim is off, and what came of it."""
         judged = self.judged
-        outcome = str(judged.outcome[0]).replace("_", " ").replace("success", "picked")
         error = f"{judged.distance_m[0] * 1000:.1f} mm, {abs(judged.yaw_error_deg[0]):.1f} deg"
-        return f"{error}   {outcome}".rstrip()
+        return f"{error}   {outcome_label(judged.outcome[0])}".rstrip()
+
+
+def outcome_label(outcome: str) -> str:
+    """An outcome of the physical check in words."""
+    return "picked" if outcome == Outcome.SUCCESS else outcome.replace("_", " ")
 
 
 class GraspAlbum:

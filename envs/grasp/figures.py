@@ -13,9 +13,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from envs.grasp.album import Judged, Shot
+from envs.grasp.album import Judged, Shot, outcome_label
 from envs.grasp.camera import project
-from envs.grasp.pick import CUP_RADIUS_M
+from envs.grasp.pick import CUP_RADIUS_M, Outcome
 from envs.grasp.scene import heading
 from envs.grasp.settings import Goal
 
@@ -26,9 +26,18 @@ STEM_M = 0.08
 RIM_POINTS = 48
 TRUE_COLOR, AIM_COLOR = "white", "magenta"
 GOOD_COLOR, BAD_COLOR = "tab:green", "tab:red"
+OUTCOME_COLORS = {
+    "": "tab:blue",
+    Outcome.SUCCESS: GOOD_COLOR,
+    Outcome.COLLISION: BAD_COLOR,
+    Outcome.MISSED: "tab:blue",
+    Outcome.NO_SEAL: "tab:orange",
+    Outcome.DROPPED: "tab:purple",
+}
 BINS = 40
 # Histograms leave out what lies beyond, so that a few wild errors do not squeeze the others.
 SHOWN_PERCENTILE = 98.0
+FARTHEST_PERCENTILE = 97.0
 DPI = 110
 
 
@@ -77,7 +86,7 @@ def error_histograms(judged: Judged, goal: Goal) -> bytes:
         axes.hist(errors, BINS, (-reach, reach), color="tab:blue")
         inside = np.mean(np.abs(errors) <= limit)
         axes.set_title(
-            f"{name}: median of the size {np.median(np.abs(errors)):.1f} {unit}, "
+            f"{name}: {np.median(np.abs(errors)):.1f} {unit} off in the median, "
             f"{inside:.0%} within ±{limit:.3g} {unit}",
             fontsize=9,
         )
@@ -88,10 +97,9 @@ def error_histograms(judged: Judged, goal: Goal) -> bytes:
 
 def workspace(judged: Judged) -> bytes:
     """Where on the support, and at which yaw, the errors are."""
-    figure = Figure(figsize=(11.0, 4.8), layout="constrained")
-    above, turned = figure.subplots(1, 2)
+    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
+    above, turned = figure.subplots(1, 2, width_ratios=(1.3, 1.0))
     distance_mm = judged.distance_m * 1000.0
-    # From above as the robot sees it: forward is up, and its left is on the left.
     dots = above.scatter(
         judged.target_m[:, 1],
         judged.target_m[:, 0],
@@ -101,16 +109,16 @@ def workspace(judged: Judged) -> bytes:
         vmin=0.0,
         vmax=float(np.percentile(distance_mm, SHOWN_PERCENTILE)),
     )
-    above.invert_xaxis()
+    above.invert_xaxis()  # as the robot sees it: forward is up, and its left is on the left
     above.set_aspect("equal")
-    above.set(xlabel="target y, left (m)", ylabel="target x, forward (m)")
+    above.set(xlabel="target y (m)", ylabel="target x (m)")
     above.set_title("position error over the support, from above", fontsize=9)
-    figure.colorbar(dots, ax=above, label="position error (mm)")
-    for outcome in sorted(set(judged.outcome)):
+    figure.colorbar(dots, ax=above, location="bottom", label="position error (mm)")
+    for outcome, color in OUTCOME_COLORS.items():
         rows = judged.outcome == outcome
-        turned.scatter(
-            judged.target_yaw_deg[rows], judged.yaw_error_deg[rows], s=10, label=outcome or None
-        )
+        if rows.any():
+            yaw, error = judged.target_yaw_deg[rows], judged.yaw_error_deg[rows]
+            turned.scatter(yaw, error, s=10, color=color, label=outcome_label(outcome))
     turned.axhline(0.0, color="gray", linewidth=0.8)
     if judged.outcome[0]:
         turned.legend(fontsize=8)
@@ -127,8 +135,10 @@ def _show(axes: Axes, image: NDArray[Any]) -> None:
     if channels == 3:
         axes.imshow(image, **place)
     else:
-        low, high = np.percentile(image, [1, 99])
-        axes.imshow(image[..., 0], cmap="turbo_r", vmin=low, vmax=high, **place)
+        # The colors are for what is near: the empty distance, clamped to the sensor's end, is not.
+        near = image[image < image.max()]
+        high = np.percentile(near, FARTHEST_PERCENTILE) if len(near) else image.max()
+        axes.imshow(image[..., 0], cmap="turbo_r", vmin=image.min(), vmax=high, **place)
     axes.set(xlim=(0, width), ylim=(height, 0))
 
 
@@ -140,8 +150,8 @@ def _draw_cup(axes: Axes, shot: Shot, tooltip_m: Floats, yaw_rad: float, color: 
     stem = np.stack([tooltip_m, tooltip_m - STEM_M * ahead])
     for points in (rim, stem):
         u, v, _ = project(shot.view, points[None])[0].T
-        axes.plot(u, v, color="black", linewidth=2.2)
-        axes.plot(u, v, color=color, linewidth=1.1)
+        axes.plot(u, v, color="black", linewidth=2.6)
+        axes.plot(u, v, color=color, linewidth=1.6)
 
 
 def _in_world(offset_m: Floats, yaw_rad: float) -> Floats:

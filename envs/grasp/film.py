@@ -19,6 +19,11 @@ FRAME_MS = 80
 LAST_FRAME_MS = 1200
 STEPS_PER_FRAME = round(FRAME_MS / 1000.0 / STEP_S)
 COLORS = 96
+# The scenes' own light is drawn for the policy's cameras, and can be dim.
+LIGHT = {
+    "light_direction": np.array([[0.3, -0.6, 0.75]]),
+    "light_intensity": np.array([0.55]),
+}
 
 
 def film(shots: Sequence[Shot], support: Support, settings: Pick, pick: bool) -> bytes:
@@ -40,7 +45,7 @@ def film(shots: Sequence[Shot], support: Support, settings: Pick, pick: bool) ->
         for number, shot in enumerate(shots, 1):
             captured = _Camera(f"{number} of {len(shots)}   {shot.caption}")
             carry_out = picker.pick if pick else picker.reach
-            carry_out(shot.scene, shot.tooltip_m, shot.yaw_rad, captured)
+            carry_out(shot.scene.with_arrays(LIGHT), shot.tooltip_m, shot.yaw_rad, captured)
             frames += captured.frames
             durations += [FRAME_MS] * (len(captured.frames) - 1) + [LAST_FRAME_MS]
     finally:

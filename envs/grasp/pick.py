@@ -199,7 +199,7 @@ class Attempt:
                 body, -1, lateralFriction=settings.friction, physicsClientId=client
             )
         self._target = blocks[0]
-        self._start_height_m = self._block()[0][2]
+        self._start_height_m = self.target_pose()[0][2]
 
     def reach(self, tooltip_m: Floats, yaw_rad: float) -> Touch:
         """Drives from home to a pose; stops where it touches.
@@ -230,7 +230,7 @@ class Attempt:
     def seals(self) -> bool:
         """Whether all of the cup's rim is on the target's face, to within a lip's give."""
         tip, axes = _pose(*self._tooltip())
-        position, rotation = _pose(*self._block())
+        position, rotation = _pose(*self.target_pose())
         angle = np.arange(RIM_POINTS)[:, None] * (2.0 * math.pi / RIM_POINTS)
         rim = tip + CUP_RADIUS_M * (np.cos(angle) * axes[:, 0] + np.sin(angle) * axes[:, 1])
         # In the block's own frame the face is the plane x = 0, a rectangle for each of its boxes.
@@ -250,11 +250,18 @@ class Attempt:
         path, _ = self._straight(pose, np.concatenate([up, held]), np.array([0.0, 0.0, 1.0]))
         for joints_rad in path:
             self._step(joints_rad)
-            grasped, _ = pybullet.multiplyTransforms(*self._block(), point, UPRIGHT)
+            grasped, _ = pybullet.multiplyTransforms(*self.target_pose(), point, UPRIGHT)
             if math.dist(grasped, self._tooltip()[0]) > settings.seal_m:
                 pybullet.removeConstraint(suction, physicsClientId=self._id)
                 return False
-        return self._block()[0][2] - self._start_height_m >= settings.lift_m - LIFT_SLACK_M
+        return self.target_pose()[0][2] - self._start_height_m >= settings.lift_m - LIFT_SLACK_M
+
+    def target_pose(self) -> Transform:
+        """Where the target is: its centre of mass, and how it is turned."""
+        pose: Transform = pybullet.getBasePositionAndOrientation(
+            self._target, physicsClientId=self._id
+        )
+        return pose
 
     def picture(self, views: Views) -> Images:
         """What an RGB camera, the first of the views, sees now: (H, W, 3)."""
@@ -332,7 +339,9 @@ class Attempt:
         tooltip = self._tooltip()
         cup = pybullet.getLinkState(self._robot.body, self._robot.cup, physicsClientId=self._id)[:2]
         on_cup = pybullet.multiplyTransforms(*pybullet.invertTransform(*cup), *tooltip)
-        on_block = pybullet.multiplyTransforms(*pybullet.invertTransform(*self._block()), *tooltip)
+        on_block = pybullet.multiplyTransforms(
+            *pybullet.invertTransform(*self.target_pose()), *tooltip
+        )
         suction = pybullet.createConstraint(
             self._robot.body,
             self._robot.cup,
@@ -357,13 +366,6 @@ class Attempt:
             physicsClientId=self._id,
         )
         return state[4], state[5]
-
-    def _block(self) -> Transform:
-        """Where the target is: its centre of mass, and how it is turned."""
-        pose: Transform = pybullet.getBasePositionAndOrientation(
-            self._target, physicsClientId=self._id
-        )
-        return pose
 
 
 def _center_of_mass(scene: Scenes, number: int) -> Floats:
