@@ -32,9 +32,9 @@ class Gallery:
         self._folder, self._names = folder, tuple(names)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            own = {REPORT, *_files_of(folder / REPORT)}
+            own = _own_files(folder / REPORT)
             taken = [name for name in (REPORT, *self._names) if (folder / name).exists()]
-            foreign = [name for name in taken if name not in own or own == {REPORT}]
+            foreign = [name for name in taken if name not in own]
         except OSError as error:
             raise UserError(f"--render: {folder}: can't be used: {error.strerror}") from error
         if foreign:
@@ -58,9 +58,9 @@ class Gallery:
             raise UserError(f"--render: {error.filename}: {error.strerror}") from error
 
 
-def _files_of(report: Path) -> list[str]:
-    """The files that a report lists; none where it is none."""
+def _own_files(report: Path) -> set[str]:
+    """The report and the files it lists; none if it is no evaluation's."""
     try:
-        return [str(name) for name in json.loads(report.read_text())[FILES]]
+        return {REPORT, *json.loads(report.read_text())[FILES]}
     except (FileNotFoundError, ValueError, KeyError, TypeError):
-        return []
+        return set()

@@ -88,8 +88,8 @@ class GraspAlbum:
     def __init__(self, settings: GraspSettings, aims: Callable[[NDArray[Any]], Aims]):
         if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
             raise ValueError(
-                f"pictures are drawn with {missing[0]}, which is not installed: "
-                "pip install 'ventosa[render]'"
+                f"pictures are drawn with {missing[0]}, which is not installed: install ventosa "
+                "with its extra `render`, pip install -e '.[render]'"
             )
         self._settings, self._aims = settings, aims
         cameras = settings.cameras

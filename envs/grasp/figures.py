@@ -83,7 +83,7 @@ def error_histograms(judged: Judged, goal: Goal) -> bytes:
     for axes, (name, errors, limit, unit) in zip(figure.subplots(2, 2).flat, panels, strict=True):
         reach = max(float(np.percentile(np.abs(errors), SHOWN_PERCENTILE)), 1.5 * limit)
         axes.axvspan(-limit, limit, color=GOOD_COLOR, alpha=0.2, linewidth=0)
-        axes.hist(errors, BINS, (-reach, reach), color="tab:blue")
+        axes.hist(errors, BINS, range=(-reach, reach), color="tab:blue")
         inside = np.mean(np.abs(errors) <= limit)
         axes.set_title(
             f"{name}: {np.median(np.abs(errors)):.1f} {unit} off in the median, "
