@@ -43,7 +43,7 @@ class DepthInput(ImageInput):
     def scale(self, raw: torch.Tensor) -> torch.Tensor:
         """Raw depths to [0, 1] over the camera's range."""
         min_m, max_m = self.space.range_m
-        return (self.space.decode(raw) - min_m) / (max_m - min_m)
+        return self.space.decode(raw).sub_(min_m).mul_(1.0 / (max_m - min_m))
 
 
 class ByteInput(ImageInput):
@@ -51,7 +51,7 @@ class ByteInput(ImageInput):
 
     def scale(self, raw: torch.Tensor) -> torch.Tensor:
         """Bytes to [0, 1]."""
-        return raw.to(torch.float32) / UINT8_MAX
+        return raw.to(torch.float32).mul_(1.0 / UINT8_MAX)
 
 
 class VectorInput(nn.Module):

@@ -91,14 +91,15 @@ class DepthImage(Box):
             Depths in metres, of the same shape, float32.
         """
         min_m, max_m = self.range_m
-        # torch has next to no arithmetic on uint16, so leave it first.
-        values = raw.float()
+        # torch has next to no arithmetic on uint16, so leave it first. What follows is in place: a
+        # copy of all pixels for each operation would cost more than the operations.
+        metres = raw.float()
         if self.encoding == "uint8":
             # The paper's equation "clamp", as in the docstring of the class.
-            metres = min_m + values * ((max_m - min_m) / UINT8_MAX)
+            metres.mul_((max_m - min_m) / UINT8_MAX).add_(min_m)
         else:
-            metres = values / MM_PER_M
-        return metres.clamp(min_m, max_m)
+            metres.div_(MM_PER_M)
+        return metres.clamp_(min_m, max_m)
 
     def __eq__(self, other: Any) -> bool:
         """Two depth spaces are equal when their numbers mean the same, too."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar, Protocol
 
 import gymnasium
+import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from pydantic import BaseModel
@@ -21,6 +22,41 @@ StepResult = tuple[Observations, NDArray[Any], NDArray[Any], NDArray[Any], dict[
 
 class EnvironmentFailure(RuntimeError):  # noqa: N818 - gymnasium's Error says something else
     """An environment broke down, through no fault of the run file: a process died, for instance."""
+
+
+class PhysicalCheck(Protocol):
+    """Carries out actions in a world with full physics, apart from the episodes."""
+
+    def __call__(self, actions: NDArray[Any]) -> dict[str, NDArray[np.bool_]]:
+        """Tries out actions (n, ...) in the first n environments, whose episodes do not notice.
+
+        Returns:
+            By name (n,): `success`, and each reason of failure; one of them is true of every row.
+        """
+
+    def close(self) -> None:
+        """Frees what it holds; calling it twice does no harm."""
+
+
+class Album(Protocol):
+    """Pictures of a policy's actions, for people to look at.
+
+    Attributes:
+        file_names: what `files` makes.
+    """
+
+    file_names: tuple[str, ...]
+
+    def add(self, actions: NDArray[Any], outcomes: Mapping[str, NDArray[np.bool_]]) -> None:
+        """Takes up actions (n, ...) in the first n environments, before they are carried out.
+
+        Args:
+            actions: those of the policy.
+            outcomes: what the physical check says of them; empty where there was none.
+        """
+
+    def files(self) -> Iterator[tuple[str, bytes]]:
+        """Draws everything: names and contents of files."""
 
 
 class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
@@ -75,3 +111,22 @@ class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     def load_state_dict(self, state: dict[str, Any]) -> Observations:
         """Goes back to a state; returns the observations it was left with."""
         raise NotImplementedError
+
+    def physical_check(self, *, window: bool = False) -> PhysicalCheck:
+        """What evaluation tries out first actions in; an environment need not have it.
+
+        Args:
+            window: show it, as it goes.
+
+        Raises:
+            ValueError: it can't be had as asked for.
+        """
+        raise ValueError("it has no physical check")
+
+    def album(self) -> Album:
+        """What evaluation has its pictures from; an environment need not have it.
+
+        Raises:
+            ValueError: it can't be had: something is not installed, perhaps.
+        """
+        raise ValueError("it has no pictures to show")

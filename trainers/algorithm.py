@@ -34,8 +34,19 @@ class Algorithm(Protocol):
 
     policy: nn.Module
 
-    def act(self, observations: Observations, *, deterministic: bool) -> Tensor:
-        """Actions (B, ...) for evaluation: the policy's best, or drawn as in training."""
+    def initial_state(self, count: int) -> Tensor:
+        """What the policy remembers where episodes begin, (count, m); m is 0 without memory."""
+
+    def act(self, observations: Observations, *, deterministic: bool) -> tuple[Tensor, Tensor]:
+        """Acts for evaluation.
+
+        Args:
+            observations: B observations, with what is remembered before them.
+            deterministic: the policy's best action, or one drawn as in training.
+
+        Returns:
+            Actions (B, ...), and what is to be remembered of each, (B, m).
+        """
 
     def collect(self) -> None:
         """Plays until there is enough experience for an update; changes no weights."""

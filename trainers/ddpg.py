@@ -150,15 +150,19 @@ class DDPG:
         self._due = 0.0  # updates that were asked for by transitions, and not made yet
         self._moments: list[_Moment] = []
 
+    def initial_state(self, count: int) -> Tensor:
+        """See `Algorithm.initial_state`; nothing is remembered."""
+        return torch.zeros(count, 0, device=self._device)
+
     @torch.no_grad()
-    def act(self, observations: Observations, *, deterministic: bool) -> Tensor:
+    def act(self, observations: Observations, *, deterministic: bool) -> tuple[Tensor, Tensor]:
         """See `Algorithm.act`; what is drawn has the noise of the run's end."""
         actions = self.policy.online.act(observations)
         if not deterministic:
             sigma = self._sigma(1.0) * self._hyperparameters.noise.deviation()
             noise = torch.randn(actions.shape, generator=self._generator, device=actions.device)
             actions = (actions + sigma * noise).clamp(-1.0, 1.0)
-        return self.policy.to_space(actions)
+        return self.policy.to_space(actions), self.initial_state(len(actions))
 
     @torch.no_grad()
     def collect(self) -> None:
@@ -214,7 +218,7 @@ class DDPG:
         with timed("act"):
             actions = self._explore(before)
         step = interaction.step(to_environment(self.policy.to_space(actions), space))
-        ended = torch.from_numpy(step.terminated | step.truncated)
+        ended = torch.from_numpy(step.done)
         self._noise.restart(ended.to(self._device))
         return _Moment(before, actions.cpu().numpy(), step, interaction.observations)
 

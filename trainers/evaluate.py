@@ -17,7 +17,12 @@ from trainers.evaluation import evaluate
 from trainers.files import write_atomically
 from trainers.learn import DONE, MISTAKE
 
-UNITS = {"position_error_m": ("mm", 1000.0), "yaw_error_deg": ("deg", 1.0)}
+UNITS = {
+    "position_error_m": ("mm", 1000.0),
+    "yaw_error_deg": ("deg", 1.0),
+    "pick_failures": ("%", 100.0),
+}
+RATES = ("success", "first_action_success", "collision_rate", "pick_rate")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,6 +35,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             seed=options.seed,
             overrides=[f"environment.simulator={options.simulator}"] if options.simulator else [],
             results_dir=options.results_dir,
+            pick=options.pick or options.window,
+            window=options.window,
+            render=options.render,
         )
         text = json.dumps(report, indent=2)
         if options.json is not None:
@@ -54,6 +62,19 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--episodes", type=_positive, help="how many (default: the environment's)")
     parser.add_argument("--seed", type=_not_negative, default=0, help="of the scenes")
     parser.add_argument("--simulator", help="overrides `environment.simulator`")
+    parser.add_argument(
+        "--pick", action="store_true", help="have the robot pick up the block, in PyBullet"
+    )
+    parser.add_argument(
+        "--window", action="store_true", help="pick before your eyes, in PyBullet's window"
+    )
+    parser.add_argument(
+        "--render",
+        nargs="?",
+        const="",
+        metavar="DIR",
+        help="draw episodes, errors and a film into DIR (default: evaluation/ in the run's folder)",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here, too")
     parser.add_argument(
         "--results-dir", type=Path, default=Path("results"), help="where runs are kept"
@@ -72,9 +93,9 @@ def table(name: str, report: dict[str, Any]) -> Table:
         if isinstance(value, dict):
             unit, factor = UNITS[key]
             for part, number in value.items():
-                label = f"{key.rsplit('_', 1)[0].replace('_', ' ')}, {part}"
+                label = f"{key.rsplit('_', 1)[0]}, {part}".replace("_", " ")
                 result.add_row(label, f"{number * factor:.2f} {unit}")
-        elif key in ("success", "first_action_success", "collision_rate"):
+        elif key in RATES:
             result.add_row(key.replace("_", " "), f"{value:.1%}")
         else:
             result.add_row(key.replace("_", " "), f"{value:.3f}")

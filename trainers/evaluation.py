@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +15,13 @@ from numpy.typing import NDArray
 from torch import nn
 
 from curricula.samplers import ParameterValue
-from envs.environment import Environment
+from envs.environment import Album, Environment, PhysicalCheck
 from trainers.algorithm import Algorithm
 from trainers.checkpoint import Loaded
 from trainers.errors import UserError
-from trainers.interaction import SUCCESS, Episodes, Interaction, concatenate
+from trainers.gallery import EVALUATION, Gallery
+from trainers.interaction import SUCCESS, Episodes, Interaction, Step, concatenate
+from trainers.memory import Sequences
 from trainers.observations import to_tensors
 from trainers.plugins import Registries, load_registries
 from trainers.policy import to_environment
@@ -37,6 +41,9 @@ def evaluate(
     seed: int,
     overrides: Sequence[str] = (),
     results_dir: Path = Path("results"),
+    pick: bool = False,
+    window: bool = False,
+    render: str | None = None,
 ) -> dict[str, Any]:
     """Evaluates a policy on the last lesson's task.
 
@@ -50,24 +57,52 @@ def evaluate(
         seed: of the scenes, which no training run has seen.
         overrides: `KEY=VALUE`s on top of the run's own configuration.
         results_dir: where a run is looked for by its id.
+        pick: try the first actions out in the environment's physical check.
+        window: show that check as it goes.
+        render: the folder for pictures; empty for `evaluation` in the run's own; None for none.
 
     Returns:
         What is known of: `episodes`, `seed`; of the deterministic policy's first action
-        `first_action_success`, `collision_rate`, `position_error_m` and `yaw_error_deg`; and of
-        the whole episodes `success`, the means `reward` and `episode_length`, and `reward_std`.
+        `first_action_success`, `collision_rate`, `position_error_m`, `yaw_error_deg`, and, after
+        `pick`, `pick_rate` and the shares of `pick_failures`; and of the whole episodes `success`,
+        the means `reward` and `episode_length`, and `reward_std`.
 
     Raises:
-        UserError: there is no such policy, or it does not fit its configuration.
+        UserError: there is no such policy, it does not fit its configuration, or what is asked for
+            can't be had.
     """
     registries = load_registries()
     loaded = find_checkpoint(policy, results_dir)
-    run = load_run(run_folder(loaded.path) / CONFIGURATION, overrides, registries)
-    with _player(run, registries, loaded, seed, FIRST_ACTION) as player:
-        count = episodes or player.interaction.env.evaluation_episodes
-        first = _first_actions(player, count)
-    with _player(run, registries, loaded, seed, WHOLE_EPISODE) as player:
+    folder = run_folder(loaded.path)
+    run = load_run(folder / CONFIGURATION, overrides, registries)
+
+    playing = partial(_player, run, registries, loaded, seed)
+    with playing(FIRST_ACTION) as player, ExitStack() as stack:
+        env, check, album, gallery = player.interaction.env, None, None, None
+        count = episodes or env.evaluation_episodes
+        if pick:
+            with _asked_for("--pick"):
+                check = stack.enter_context(closing(env.physical_check(window=window)))
+        if render is not None:
+            with _asked_for("--render"):
+                album = env.album()
+            gallery = Gallery(Path(render) if render else folder / EVALUATION, album.file_names)
+        first = _first_actions(player, count, check, album)
+    with playing(WHOLE_EPISODE) as player:
         whole = _whole_episodes(player, count, deterministic=not first)
-    return {"episodes": count, "seed": seed, **whole, **first}
+    report = {"episodes": count, "seed": seed, **whole, **first}
+    if album is not None and gallery is not None:
+        gallery.write(report, album.files())
+    return report
+
+
+@contextmanager
+def _asked_for(option: str) -> Iterator[None]:
+    """What can't be had of what an option asks for is the user's mistake."""
+    try:
+        yield
+    except ValueError as error:
+        raise UserError(f"{option}: {error}") from error
 
 
 def final_parameters(run: RunSettings) -> dict[str, ParameterValue]:
@@ -105,6 +140,7 @@ class _Player:
             self._generator,
             torch.device("cpu"),
         )
+        self._remembered = self._algorithm.initial_state(env.num_envs)
 
     def load(self, weights: dict[str, torch.Tensor], where: str) -> None:
         """Takes over weights."""
@@ -114,14 +150,28 @@ class _Player:
         except RuntimeError as error:
             raise UserError(f"{where}: these weights do not fit the run's configuration") from error
 
+    def reset(self) -> None:
+        """Begins an episode everywhere."""
+        self.interaction.reset()
+        self._remembered = self._algorithm.initial_state(self.interaction.env.num_envs)
+
     @torch.no_grad()
     def actions(self, *, deterministic: bool) -> NDArray[Any]:
         """Actions for the present observations."""
         env = self.interaction.env
         space = env.single_observation_space
         observations = to_tensors(self.interaction.observations, space, torch.device("cpu"))
-        actions = self._algorithm.act(observations, deterministic=deterministic)
+        actions, self._remembered = self._algorithm.act(
+            replace(observations, sequences=Sequences.single(self._remembered)),
+            deterministic=deterministic,
+        )
         return to_environment(actions, env.single_action_space)
+
+    def step(self, *, deterministic: bool) -> Step:
+        """Acts once everywhere; where an episode ends, it is forgotten."""
+        step = self.interaction.step(self.actions(deterministic=deterministic))
+        self._remembered[torch.from_numpy(step.done)] = 0.0
+        return step
 
 
 def _whole_episodes(player: _Player, episodes: int, *, deterministic: bool) -> dict[str, Any]:
@@ -134,10 +184,9 @@ def _whole_episodes(player: _Player, episodes: int, *, deterministic: bool) -> d
     share = np.full(count, episodes // count) + (np.arange(count) < episodes % count)
     parts: list[Episodes] = []
     ended = np.zeros(count, np.int64)
-    interaction.reset()
+    player.reset()
     while (ended < share).any():
-        step = interaction.step(player.actions(deterministic=deterministic))
-        done = np.flatnonzero(step.terminated | step.truncated)
+        done = np.flatnonzero(player.step(deterministic=deterministic).done)
         finished = interaction.take_finished()
         parts.append(finished[ended[done] < share[done]])
         ended[done] += 1
@@ -151,27 +200,49 @@ def _whole_episodes(player: _Player, episodes: int, *, deterministic: bool) -> d
     }
 
 
-def _first_actions(player: _Player, episodes: int) -> dict[str, Any]:
+def _first_actions(
+    player: _Player, episodes: int, check: PhysicalCheck | None, album: Album | None
+) -> dict[str, Any]:
     """Takes the deterministic policy's first action in every scene."""
-    interaction = player.interaction
-    parts: list[dict[str, NDArray[Any]]] = []
-    for _ in range(-(-episodes // interaction.env.num_envs)):
-        interaction.reset()
-        *_, infos = interaction.env.step(player.actions(deterministic=True))
-        if "position_error_m" not in infos.get("measures", {}):
-            return {}
-        parts.append(infos["measures"])
-    values = {k: np.concatenate([part[k] for part in parts])[:episodes] for k in parts[0]}
-    error = values["position_error_m"]
+    env = player.interaction.env
+    measures: list[dict[str, NDArray[Any]]] = []
+    outcomes: list[dict[str, NDArray[Any]]] = []
+    for begin in range(0, episodes, env.num_envs):
+        player.reset()
+        actions = player.actions(deterministic=True)
+        # The last batch may have more environments than are asked for; and a step would reset them.
+        asked_for = actions[: episodes - begin]
+        outcomes.append(check(asked_for) if check is not None else {})
+        if album is not None:
+            album.add(asked_for, outcomes[-1])
+        *_, infos = env.step(actions)
+        measures.append(infos.get("measures", {}))
+    return {**_errors(_joined(measures, episodes)), **_picks(_joined(outcomes, episodes))}
+
+
+def _joined(parts: Sequence[dict[str, NDArray[Any]]], rows: int) -> dict[str, NDArray[Any]]:
+    return {name: np.concatenate([part[name] for part in parts])[:rows] for name in parts[0]}
+
+
+def _errors(measures: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    if "position_error_m" not in measures:
+        return {}
     return {
-        "first_action_success": float(values["success"].mean()),
-        "collision_rate": float(values["collision"].mean()),
+        "first_action_success": float(measures[SUCCESS].mean()),
+        "collision_rate": float(measures["collision"].mean()),
         "position_error_m": {
-            **_median_and_p95(error),
-            **{axis: float(np.median(values[f"position_error_{axis}_m"])) for axis in "xyz"},
+            **_median_and_p95(measures["position_error_m"]),
+            **{axis: float(np.median(measures[f"position_error_{axis}_m"])) for axis in "xyz"},
         },
-        "yaw_error_deg": _median_and_p95(values["yaw_error_deg"]),
+        "yaw_error_deg": _median_and_p95(measures["yaw_error_deg"]),
     }
+
+
+def _picks(outcomes: Mapping[str, NDArray[np.bool_]]) -> dict[str, Any]:
+    if not outcomes:
+        return {}
+    rates = {name: float(rows.mean()) for name, rows in outcomes.items()}
+    return {"pick_rate": rates.pop(SUCCESS), "pick_failures": rates}
 
 
 def _median_and_p95(values: NDArray[np.float64]) -> dict[str, float]:

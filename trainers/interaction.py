@@ -42,6 +42,11 @@ class Step:
     same_frame: NDArray[np.bool_]
     final_observations: Mapping[str, NDArray[Any]] | None
 
+    @property
+    def done(self) -> NDArray[np.bool_]:
+        """(N,) the episode ended, terminated or truncated."""
+        return self.terminated | self.truncated
+
 
 @dataclass(frozen=True)
 class Episodes:
@@ -128,8 +133,9 @@ class Interaction:
             observations, reward, terminated, truncated, infos = self.env.step(actions)
         self.step_count += self.env.num_envs
         terms = infos.get("reward_terms", {})
-        for name, values in {**terms, "reward": reward}.items():
-            self._check(f"reward {name!r}" if name != "reward" else "reward", values)
+        for name, values in terms.items():
+            self._check(f"reward {name!r}", values)
+        self._check("reward", reward)
         self._check_observations(observations)
         done = terminated | truncated
         final = infos.get("final_obs") if done.any() else None
@@ -207,7 +213,10 @@ class Interaction:
 
     def _check(self, what: str, values: NDArray[Any], of: NDArray[np.bool_] | None = None) -> None:
         """Refuses what is not finite, in all environments or in those where `of` (N,) is set."""
-        broken = ~np.isfinite(values)
+        finite = np.isfinite(values)
+        if finite.all():
+            return
+        broken = ~finite
         if of is not None:
             broken[~of] = False
         if broken.any():

@@ -1,4 +1,4 @@
-"""Encoders and a trunk: from observations to a hidden vector."""
+"""Encoders, a trunk and perhaps memory: from observations to a hidden vector."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pydantic import BaseModel, Field
 from torch import Tensor, nn
 
 from trainers.errors import UserError
+from trainers.memory import MemorySettings, Recurrent, Sequences
 from trainers.observations import Observations, is_frame
 from trainers.plugins import suggestion
 from trainers.settings import Component
@@ -33,6 +34,11 @@ class NetworkSettings(BaseModel, frozen=True, extra="forbid"):
     activation: Literal["relu", "tanh", "silu", "elu"] = Field(
         "relu", description="Activation of the hidden layers."
     )
+    precision: Literal["float32", "bfloat16"] = Field(
+        "float32",
+        description="Numbers that encoders and hidden layers calculate with; bfloat16 is faster "
+        "where the processor knows it. Weights, memory, heads and losses are always float32.",
+    )
     normalize: bool = Field(
         False, description="Standardise vector observations whose encoder is not set otherwise."
     )
@@ -47,15 +53,17 @@ class Standardizing(Protocol):
 
 
 class Network(nn.Module):
-    """Encodes observations and passes them through a trunk of dense layers.
+    """Encodes observations, passes them through a trunk of dense layers, and perhaps remembers.
 
     Args:
         encoders: by the name of the observation; frames and vectors are told apart by `spaces`.
         spaces: of the same names.
         settings: the trunk.
+        memory: what follows the trunk, if anything.
 
     Attributes:
         features_dim: length of the hidden vector.
+        state_size: numbers that it remembers; 0 without memory.
     """
 
     def __init__(
@@ -63,6 +71,7 @@ class Network(nn.Module):
         encoders: Mapping[str, nn.Module],
         spaces: Mapping[str, gymnasium.Space[Any]],
         settings: NetworkSettings,
+        memory: MemorySettings | None = None,
     ):
         super().__init__()
         self.frame_encoders = nn.ModuleDict(
@@ -73,7 +82,10 @@ class Network(nn.Module):
         )
         width = sum(cast(int, encoder.features_dim) for encoder in encoders.values())
         self.trunk, width = hidden_layers(width, settings)
-        self.features_dim = width
+        self._lowered = settings.precision == "bfloat16"
+        self.memory = None if memory is None else Recurrent(width, memory)
+        self.features_dim = width if self.memory is None else self.memory.features_dim
+        self.state_size = 0 if self.memory is None else self.memory.state_size
 
     def encode_frames(self, frames: Mapping[str, Tensor]) -> Tensor | None:
         """What frames alone decide, (U, f); None for a network without cameras.
@@ -83,17 +95,38 @@ class Network(nn.Module):
         """
         if not self.frame_encoders:
             return None
-        parts = [encoder(frames[name]) for name, encoder in self.frame_encoders.items()]
-        features = torch.cat(parts, dim=1)
-        return features if self.vector_encoders else self.trunk(features)
+        with self._precision(next(iter(frames.values())).device):
+            parts = [encoder(frames[name]) for name, encoder in self.frame_encoders.items()]
+            features = torch.cat(parts, dim=1)
+            return (features if self.vector_encoders else self.trunk(features)).float()
 
     def forward(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
-        """Hidden vectors (B, features_dim).
+        """Hidden vectors (B, features_dim) alone; see `recall`."""
+        return self.recall(observations, frame_features)[0]
+
+    def recall(
+        self, observations: Observations, frame_features: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Hidden vectors, and what is to be remembered.
 
         Args:
             observations: B observations.
             frame_features: (B, f) what `encode_frames` said of their frames, where it is known.
+
+        Returns:
+            (B, features_dim), and the state (S, state_size) after the last of each sequence.
         """
+        hidden = self._react(observations, frame_features)
+        sequences = observations.sequences
+        if sequences is None:
+            sequences = Sequences.single(hidden.new_zeros(len(hidden), self.state_size))
+        if self.memory is None:
+            return hidden, sequences.state
+        recalled: tuple[Tensor, Tensor] = self.memory(hidden, sequences)
+        return recalled
+
+    def _react(self, observations: Observations, frame_features: Tensor | None) -> Tensor:
+        """What the trunk says (B, ...) of each observation by itself."""
         if frame_features is None:
             frame_features = self.encode_frames(observations.frames)
             if frame_features is not None and observations.frame_index is not None:
@@ -102,9 +135,12 @@ class Network(nn.Module):
         if not self.vector_encoders:
             return parts[0]
         vectors = observations.vectors
-        parts += [encoder(vectors[name]) for name, encoder in self.vector_encoders.items()]
-        hidden: Tensor = self.trunk(torch.cat(parts, dim=1))
-        return hidden
+        with self._precision(next(iter(vectors.values())).device):
+            parts += [encoder(vectors[name]) for name, encoder in self.vector_encoders.items()]
+            return self.trunk(torch.cat(parts, dim=1)).float()
+
+    def _precision(self, device: torch.device) -> torch.autocast:
+        return torch.autocast(device.type, torch.bfloat16, enabled=self._lowered)
 
     def update_statistics(self, vectors: Mapping[str, Tensor]) -> None:
         """Shows vectors (B, n) to the encoders that standardise."""
@@ -145,7 +181,12 @@ class NetworkFactory:
                 f"{suggestion(name, self.observation_space.spaces)}"
             )
 
-    def network(self, settings: NetworkSettings, names: Sequence[str]) -> Network:
+    def network(
+        self,
+        settings: NetworkSettings,
+        names: Sequence[str],
+        memory: MemorySettings | None = None,
+    ) -> Network:
         """A new network on some of the observations.
 
         Raises:
@@ -153,7 +194,7 @@ class NetworkFactory:
         """
         spaces = {name: self.observation_space[name] for name in names}
         encoders = {name: self._encoder(name, settings) for name in names}
-        return Network(encoders, spaces, settings)
+        return Network(encoders, spaces, settings, memory)
 
     def _encoder(self, name: str, settings: NetworkSettings) -> nn.Module:
         space = self.observation_space[name]

@@ -6,7 +6,7 @@ Vectors change every step and are kept as they are.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from trainers.memory import Sequences
 
 IMAGE_DIMENSIONS = 3
 
@@ -27,11 +29,14 @@ class Observations:
         frames: by name, images (U, H, W, C) in their own type.
         vectors: by name, (B, n).
         frame_index: (B,) which of the U frames belongs to each; None: U = B, in this order.
+        sequences: which of them follow each other, and what is remembered before; None: each is
+            the first of its episode. Only networks with memory ask.
     """
 
     frames: dict[str, Tensor]
     vectors: dict[str, Tensor]
     frame_index: Tensor | None = None
+    sequences: Sequences | None = None
 
 
 def is_frame(space: gymnasium.Space[Any]) -> bool:
@@ -61,3 +66,16 @@ def take(tensor: Tensor, index: Tensor | tuple[Tensor, ...]) -> Tensor:
     if tensor.dtype == torch.uint16:
         return tensor.view(torch.int16)[index].view(torch.uint16)
     return tensor[index]
+
+
+def frames_differ(
+    first: Mapping[str, NDArray[Any]],
+    second: Mapping[str, NDArray[Any]],
+    names: Iterable[str],
+    rows: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Whether any of the frames of these names differ between two batches, at some rows."""
+    differ = np.zeros(len(rows), bool)
+    for name in names:
+        differ |= (first[name][rows] != second[name][rows]).any(axis=(1, 2, 3))
+    return differ

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trainers.interaction import Interaction, Step
-from trainers.observations import Observations, to_tensors
+from trainers.memory import Sequences, number_sequences
+from trainers.observations import Observations, frames_differ, to_tensors
 from trainers.policy import ActorCritic, FrameFeatures, to_environment
 from trainers.returns import gae
 from trainers.reward_normalizer import RewardNormalizer
@@ -22,6 +23,8 @@ from trainers.timers import timed
 
 class OnPolicyCollector:
     """Plays T steps in each of N environments with a policy that does not change meanwhile.
+
+    What the policy remembers of its running episodes is carried from one collection to the next.
 
     Args:
         policy: draws the actions and values the observations.
@@ -46,6 +49,7 @@ class OnPolicyCollector:
         self._reward_normalizer = reward_normalizer
         env = interaction.env
         self._space, self._action_space = env.single_observation_space, env.single_action_space
+        self._remembered = policy.initial_state(env.num_envs)
 
     @torch.no_grad()
     def collect(self, gamma: float, lambd: float) -> Rollout:
@@ -56,11 +60,14 @@ class OnPolicyCollector:
         """
         frames = _Frames(self._policy, self._interaction, self._steps, self._device)
         moments = [self._play(frames) for _ in range(self._steps)]
-        last = to_tensors(self._interaction.observations, self._space, self._device)
+        last = self._tensors(self._interaction.observations, self._remembered)
         advantages, returns = self._estimate(moments, self._policy.value(last), gamma, lambd)
+        frame_index = torch.cat([moment.frame_index for moment in moments])
         return Rollout(
             frames=frames.tensors(),
-            frame_index=torch.cat([moment.frame_index for moment in moments]),
+            frame_index=frame_index,
+            groups=self._sequences(moments) if self._policy.state_size else frame_index,
+            states=torch.cat([moment.state for moment in moments]),
             vectors={
                 name: torch.cat([moment.vectors[name] for moment in moments])
                 for name in moments[0].vectors
@@ -75,42 +82,81 @@ class OnPolicyCollector:
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on exactly."""
         normalizer = self._reward_normalizer
-        return {"reward_normalizer": None if normalizer is None else normalizer.state_dict()}
+        return {
+            "remembered": self._remembered,
+            "reward_normalizer": None if normalizer is None else normalizer.state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes back to a state."""
+        self._remembered = state["remembered"].to(self._device)
         if self._reward_normalizer is not None:
             self._reward_normalizer.load_state_dict(state["reward_normalizer"])
 
     def _play(self, frames: _Frames) -> _Moment:
         """Acts once in every environment."""
-        raw = self._interaction.observations
-        frame_index, features = frames.look(raw)
+        raw, state = self._interaction.observations, self._remembered
+        frame_index = frames.look(raw)
         with timed("act"):
-            vectors = {name: values for name, values in raw.items() if name not in frames.names}
-            observations = to_tensors(vectors, self._space, self._device)
-            distribution, values = self._policy(observations, features)
+            observations = self._tensors(frames.without(raw), state)
+            distribution, values, after = self._policy.step(observations, frames.features)
             actions = distribution.sample(self._generator)
         step = self._interaction.step(to_environment(actions, self._action_space))
         frames.new = np.flatnonzero(~step.same_frame)
+        self._remembered = after.masked_fill(self._tensor(step.done)[:, None], 0.0)
         return _Moment(
             frame_index=frame_index,
             vectors=observations.vectors,
+            state=state,
             actions=actions,
             log_probs=distribution.log_prob(actions),
             values=values,
-            final_values=self._final_values(step, values),
+            final_values=self._final_values(raw, frames, step, after),
             step=step,
         )
 
-    def _final_values(self, step: Step, like: Tensor) -> Tensor:
-        """Values (N,) of the last observations of episodes that were cut off; else zero."""
-        values = torch.zeros_like(like)
-        rows = np.flatnonzero(step.truncated)
-        if len(rows) and step.final_observations is not None:
-            final = to_tensors(step.final_observations, self._space, self._device, rows)
-            values[torch.from_numpy(rows).to(self._device)] = self._policy.value(final)
+    def _tensors(
+        self,
+        raw: Mapping[str, NDArray[Any]],
+        state: Tensor,
+        rows: NDArray[np.int64] | None = None,
+    ) -> Observations:
+        """Observations in all environments or some, with what is remembered before them (B, m)."""
+        observations = to_tensors(raw, self._space, self._device, rows)
+        return replace(observations, sequences=Sequences.single(state))
+
+    def _final_values(
+        self, raw: Mapping[str, NDArray[Any]], frames: _Frames, step: Step, state: Tensor
+    ) -> Tensor:
+        """Values (N,) of the last observations of episodes that were cut off; else zero.
+
+        Args:
+            raw: what was observed before the step.
+            frames: with the features of that.
+            step: what has just happened.
+            state: (N, m) what is remembered after it.
+        """
+        values = torch.zeros(len(state), device=self._device)
+        cut, final = np.flatnonzero(step.truncated), step.final_observations
+        if not len(cut) or final is None:
+            return values
+        # With frame grab an episode's last image is its first, whose features are known.
+        differ = frames_differ(final, raw, frames.names, cut)
+        same, other = self._tensor(cut[~differ]), self._tensor(cut[differ])
+        if len(same):
+            vectors = self._tensors(frames.without(final), state[same], cut[~differ])
+            values[same] = self._policy.value(vectors, frames.features.rows(same))
+        if len(other):
+            values[other] = self._policy.value(self._tensors(final, state[other], cut[differ]))
         return values
+
+    def _sequences(self, moments: list[_Moment]) -> Tensor:
+        """Numbers (M,) of the sequences that the transitions belong to."""
+        done = np.stack([moment.step.done for moment in moments])
+        return self._tensor(number_sequences(done, self._policy.sequence_length).ravel())
+
+    def _tensor(self, array: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(array).to(self._device)
 
     def _estimate(
         self, moments: list[_Moment], last_values: Tensor, gamma: float, lambd: float
@@ -146,6 +192,7 @@ class _Moment:
 
     frame_index: Tensor
     vectors: dict[str, Tensor]
+    state: Tensor
     actions: Tensor
     log_probs: Tensor
     values: Tensor
@@ -159,6 +206,7 @@ class _Frames:
     Attributes:
         names: the observations that are frames.
         new: the environments whose frame has not been looked at yet.
+        features: of the frames in view.
     """
 
     def __init__(
@@ -171,11 +219,11 @@ class _Frames:
         self.names = frozenset(spaces)
         self._store = FrameStore(spaces, steps * self._count, device)
         self._index = np.zeros(self._count, np.int64)
-        self._features = FrameFeatures(None, None)
+        self.features = FrameFeatures(None, None)
         self.new = np.arange(self._count)
 
-    def look(self, raw: Mapping[str, NDArray[Any]]) -> tuple[Tensor, FrameFeatures]:
-        """Keeps and encodes the new frames; returns everyone's index (N,) and features.
+    def look(self, raw: Mapping[str, NDArray[Any]]) -> Tensor:
+        """Keeps and encodes the new frames; returns everyone's index (N,).
 
         Without cameras every observation counts as a frame of its own.
         """
@@ -183,9 +231,13 @@ class _Frames:
             self.new = np.arange(self._count)
         if len(self.new):
             self._index[self.new] = self._store.add(raw, self.new)
-            with timed("encode"):
+            if self.names:
                 self._encode()
-        return torch.from_numpy(self._index.copy()).to(self._device), self._features
+        return torch.from_numpy(self._index.copy()).to(self._device)
+
+    def without(self, raw: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """The observations that are not frames."""
+        return {name: values for name, values in raw.items() if name not in self.names}
 
     def tensors(self) -> dict[str, Tensor]:
         """All frames by name, (U, H, W, C)."""
@@ -193,8 +245,9 @@ class _Frames:
 
     def _encode(self) -> None:
         latest = self._store.tensors(self._store.count - len(self.new))
-        fresh = self._policy.encode_frames(Observations(latest, {}))
+        with timed("encode"):
+            fresh = self._policy.encode_frames(Observations(latest, {}))
         if len(self.new) < self._count:
             rows = torch.from_numpy(self.new).to(self._device)
-            fresh = self._features.with_rows(rows, fresh)
-        self._features = fresh
+            fresh = self.features.with_rows(rows, fresh)
+        self.features = fresh

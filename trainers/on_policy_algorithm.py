@@ -83,10 +83,15 @@ class OnPolicyAlgorithm:
         self._interaction, self._generator = interaction, generator
         self._rollout: Rollout | None = None
 
-    def act(self, observations: Observations, *, deterministic: bool) -> Tensor:
+    def initial_state(self, count: int) -> Tensor:
+        """See `Algorithm.initial_state`."""
+        return self.policy.initial_state(count)
+
+    def act(self, observations: Observations, *, deterministic: bool) -> tuple[Tensor, Tensor]:
         """See `Algorithm.act`."""
-        distribution = self.policy.distribution(observations)
-        return distribution.mode() if deterministic else distribution.sample(self._generator)
+        distribution, _, state = self.policy.step(observations)
+        actions = distribution.mode() if deterministic else distribution.sample(self._generator)
+        return actions, state
 
     def collect(self) -> None:
         """See `Algorithm.collect`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Literal
 
 import gymnasium
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 
 from trainers.distributions import Categorical, DiagonalGaussian, Distribution
 from trainers.errors import UserError
+from trainers.memory import MemorySettings
 from trainers.networks import NetworkFactory, NetworkSettings, head
 from trainers.observations import Observations
 
@@ -46,6 +48,9 @@ class PolicySettings(ActorCriticSettings, frozen=True, extra="forbid"):
     min_std: float = Field(
         0.001, gt=0.0, description="Continuous actions: the standard deviation never falls below."
     )
+    memory: MemorySettings | None = Field(
+        None, description="A recurrent layer in the actor and in a separate critic; null: none."
+    )
 
     @model_validator(mode="after")
     def _critic_can_see(self) -> PolicySettings:
@@ -65,6 +70,10 @@ class ActorCritic(nn.Module):
         factory: builds the networks.
         settings: what they look like.
 
+    Attributes:
+        state_size: numbers that the actor and a separate critic remember; 0 without memory.
+        sequence_length: steps through which gradients flow back; 1 without memory.
+
     Raises:
         UserError: the settings don't fit the environment.
     """
@@ -72,8 +81,16 @@ class ActorCritic(nn.Module):
     def __init__(self, factory: NetworkFactory, settings: PolicySettings):
         super().__init__()
         actor, critic = observed(factory, settings)
-        self.actor = factory.network(settings, actor)
-        self.critic = factory.network(settings, critic) if settings.critic == "separate" else None
+        self.actor = factory.network(settings, actor, settings.memory)
+        self.critic = (
+            factory.network(settings, critic, settings.memory)
+            if settings.critic == "separate"
+            else None
+        )
+        self.state_size = self.actor.state_size
+        if self.critic is not None:
+            self.state_size += self.critic.state_size
+        self.sequence_length = 1 if settings.memory is None else settings.memory.sequence_length
         width = self.actor.features_dim
         self.action_head: nn.Linear
         self.log_std: nn.Parameter | None = None
@@ -94,22 +111,41 @@ class ActorCritic(nn.Module):
             width if self.critic is None else self.critic.features_dim, 1, CRITIC_GAIN
         )
 
+    def initial_state(self, count: int) -> Tensor:
+        """What is remembered where episodes begin, (count, state_size)."""
+        return self.value_head.weight.new_zeros(count, self.state_size)
+
     def forward(
         self, observations: Observations, features: FrameFeatures | None = None
     ) -> tuple[Distribution, Tensor]:
         """The distribution of actions and the values (B,)."""
+        distribution, values, _ = self.step(observations, features)
+        return distribution, values
+
+    def step(
+        self, observations: Observations, features: FrameFeatures | None = None
+    ) -> tuple[Distribution, Tensor, Tensor]:
+        """The distribution of actions, the values (B,), and the state (S, state_size) after."""
         known = features or FrameFeatures(None, None)
-        hidden = self.actor(observations, known.actor)
-        return self._distribution(hidden), self._value(observations, hidden, known)
+        seen_by_actor, seen_by_critic = self._split(observations)
+        hidden, state = self.actor.recall(seen_by_actor, known.actor)
+        distribution, critic_hidden = self._distribution(hidden), hidden
+        if self.critic is not None:
+            critic_hidden, critic_state = self.critic.recall(seen_by_critic, known.critic)
+            state = torch.cat([state, critic_state], dim=1)
+        return distribution, self._value(critic_hidden), state
 
     def distribution(self, observations: Observations) -> Distribution:
         """The distribution of actions alone."""
-        return self._distribution(self.actor(observations))
+        return self._distribution(self.actor(self._split(observations)[0]))
 
-    def value(self, observations: Observations) -> Tensor:
+    def value(self, observations: Observations, features: FrameFeatures | None = None) -> Tensor:
         """The values (B,) alone."""
-        hidden = self.actor(observations) if self.critic is None else None
-        return self._value(observations, hidden, FrameFeatures(None, None))
+        known = features or FrameFeatures(None, None)
+        seen_by_actor, seen_by_critic = self._split(observations)
+        if self.critic is None:
+            return self._value(self.actor(seen_by_actor, known.actor))
+        return self._value(self.critic(seen_by_critic, known.critic))
 
     def encode_frames(self, observations: Observations) -> FrameFeatures:
         """What the encoders say of frames, to be reused as long as neither changes."""
@@ -142,13 +178,20 @@ class ActorCritic(nn.Module):
         floor = torch.tensor(self._min_log_std, device=outputs.device)
         return DiagonalGaussian(outputs, torch.logaddexp(self.log_std, floor))
 
-    def _value(
-        self, observations: Observations, hidden: Tensor | None, known: FrameFeatures
-    ) -> Tensor:
-        if self.critic is not None:
-            hidden = self.critic(observations, known.critic)
+    def _value(self, hidden: Tensor) -> Tensor:
         value: Tensor = self.value_head(hidden).squeeze(-1)
         return value
+
+    def _split(self, observations: Observations) -> tuple[Observations, Observations]:
+        """The observations with what the actor remembers, and with what the critic does."""
+        sequences = observations.sequences
+        if sequences is None or self.state_size == 0:
+            return observations, observations
+        actor, critic = sequences.state.tensor_split([self.actor.state_size], dim=1)
+        return (
+            replace(observations, sequences=replace(sequences, state=actor)),
+            replace(observations, sequences=replace(sequences, state=critic)),
+        )
 
 
 class FrameFeatures:
@@ -156,6 +199,11 @@ class FrameFeatures:
 
     def __init__(self, actor: Tensor | None, critic: Tensor | None):
         self.actor, self.critic = actor, critic
+
+    def rows(self, rows: Tensor) -> FrameFeatures:
+        """Those of some rows."""
+        actor, critic = (None if f is None else f[rows] for f in (self.actor, self.critic))
+        return FrameFeatures(actor, critic)
 
     def with_rows(self, rows: Tensor, other: FrameFeatures) -> FrameFeatures:
         """These, with other features at some rows."""

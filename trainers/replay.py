@@ -20,7 +20,7 @@ from torch import Tensor
 
 from trainers.errors import UserError
 from trainers.interaction import Step
-from trainers.observations import Observations, is_frame
+from trainers.observations import Observations, frames_differ, is_frame
 
 NONE = -1
 _FRAME = ""  # no observation has this name
@@ -249,9 +249,7 @@ class ReplayBuffer:
             raise ValueError("an episode was truncated, and the infos have no `final_obs`")
         final = step.final_observations
         frame = self._frame[places].copy()
-        differ = np.zeros(len(cut), bool)
-        for name in self._frames.names:
-            differ |= (final[name][cut] != observations[name][cut]).any(axis=(1, 2, 3))
+        differ = frames_differ(final, observations, self._frames.names, cut)
         frame[cut[differ]] = self._frames.add(final, cut[differ])
         self._final[places][cut] = self._finals.add({**final, _FRAME: frame}, cut)
 

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from trainers.memory import Sequences
 from trainers.observations import Observations, is_frame, take
 
 
@@ -61,6 +62,9 @@ class Rollout:
         frames: by name, (U, H, W, C).
         frame_index: which of the U frames belongs to each transition.
         vectors: by name, (M, n).
+        groups: the number, from 0, of the group that each belongs to, which stays together: the
+            transitions of one frame or, of a policy with memory, those of one sequence.
+        states: (M, m) what the policy remembered before each; m is 0 without memory.
         actions: as the policy drew them, before any clipping.
         log_probs: of the actions under the policy that drew them.
         values: under the critic of that time.
@@ -71,6 +75,8 @@ class Rollout:
     frames: dict[str, Tensor]
     frame_index: Tensor
     vectors: dict[str, Tensor]
+    groups: Tensor
+    states: Tensor
     actions: Tensor
     log_probs: Tensor
     values: Tensor
@@ -81,21 +87,37 @@ class Rollout:
         return len(self.actions)
 
     def observations(self, rows: Tensor) -> Observations:
-        """Observations of some transitions, with the frames they share once."""
-        frames, index = self.frame_index[rows].unique(return_inverse=True)
+        """Observations of some transitions, with the frames they share once.
+
+        Args:
+            rows: (B,) in an order that `minibatches` or `in_groups` gives.
+        """
+        frames, index = self.frame_index[rows], None
+        distinct, place = frames.unique(return_inverse=True)
+        if len(distinct) < len(frames):
+            frames, index = distinct, place
         chosen = {name: take(tensor, frames) for name, tensor in self.frames.items()}
-        return Observations(chosen, {k: v[rows] for k, v in self.vectors.items()}, index)
+        vectors = {name: values[rows] for name, values in self.vectors.items()}
+        _, lengths = self.groups[rows].unique_consecutive(return_counts=True)
+        first = rows[lengths.cumsum(0) - lengths]
+        sequences = Sequences(lengths.cpu(), self.states[first])
+        return Observations(chosen, vectors, index, sequences)
+
+    def in_groups(self) -> Tensor:
+        """All rows (M,), those of one group side by side and in the order of time."""
+        return self.groups.argsort(stable=True)
 
     def minibatches(self, size: int, generator: torch.Generator) -> Iterator[Tensor]:
         """Splits all transitions at random into parts of `size` rows; the last may be smaller.
 
-        Transitions of one frame stay together, so that it is encoded once in a pass. Where every
-        transition has its own frame, this is a plain random split.
+        Transitions of one group stay together, in the order of time: a frame is encoded once in a
+        pass, and a sequence is cut at most where a part ends. Where every transition is a group of
+        its own, this is a plain random split.
         """
-        count = int(self.frame_index.max()) + 1
-        device = self.frame_index.device
+        count = int(self.groups.max()) + 1
+        device = self.groups.device
         place = torch.randperm(count, generator=generator, device=device)
-        order = torch.argsort(place[self.frame_index], stable=True)
+        order = torch.argsort(place[self.groups], stable=True)
         yield from order.split(size)
 
 

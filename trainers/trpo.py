@@ -129,12 +129,13 @@ class TRPO(OnPolicyAlgorithm):
 
     def _improve_policy(self, rollout: Rollout, delta: float) -> dict[str, float]:
         hyper = self._hyperparameters
-        everything = torch.arange(len(rollout), device=rollout.actions.device)
-        observations = rollout.observations(everything)
-        advantages = normalize(rollout.advantages)
+        rows = rollout.in_groups()
+        observations = rollout.observations(rows)
+        actions, log_probs = rollout.actions[rows], rollout.log_probs[rows]
+        advantages = normalize(rollout.advantages)[rows]
 
         def gain_of(distribution: Distribution) -> Tensor:
-            return surrogate_gain(distribution, rollout.actions, rollout.log_probs, advantages)
+            return surrogate_gain(distribution, actions, log_probs, advantages)
 
         distribution = self.policy.distribution(observations)
         gain, old = gain_of(distribution), distribution.detach()

@@ -24,7 +24,8 @@ DISC_RADIUS_M = 0.04
 # The largest disc of a bar that meets a leg is never smaller than half the bar's thickness.
 MIN_BAR_M = 2.0 * DISC_RADIUS_M
 MAX_BAR_SHARE = 0.5
-L_LEG_SHARE = (0.4, 0.6)
+# From half the width on, an L's centre of mass is over its leg whatever the bar, so that it stands.
+L_LEG_SHARE = (0.5, 0.6)
 U_LEG_SHARE = (0.25, 0.35)
 
 

@@ -39,6 +39,19 @@ class Views(Batch):
     noise_sigma_m: Floats
 
 
+# Outside, with the whole robot and the support in view.
+OVERVIEW = Camera(
+    type="rgb",
+    width=640,
+    height=480,
+    fov_deg=62.0,
+    position_m=(2.0, -1.6, 1.6),
+    target_m=(0.7, 0.0, 0.9),
+    near_m=(0.1, 0.1),
+    far_m=(10.0, 10.0),
+)
+
+
 def focal_length_px(camera: Camera) -> float:
     """Focal length in pixels, the same for both axes."""
     return camera.width / 2.0 / float(np.tan(np.radians(camera.fov_deg) / 2.0))
@@ -84,6 +97,12 @@ def sample_views(
         rng.uniform(*camera.far_m, n),
         np.full(n, camera.noise_sigma_m),
     )
+
+
+def overviews(n: int, **other: Any) -> Views:
+    """The overview n times, never moved; `other` are fields of its `Camera` to have otherwise."""
+    camera = OVERVIEW.model_copy(update=other)
+    return sample_views(camera, np.random.default_rng(0), n, position_m=0.0, rotation_deg=0.0)
 
 
 def project(views: Views, points_m: Floats) -> Floats:

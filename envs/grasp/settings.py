@@ -138,6 +138,37 @@ class Goal(BaseModel, frozen=True, extra="forbid"):
         return self
 
 
+class Pick(BaseModel, frozen=True, extra="forbid"):
+    """The physical pick, with which a policy is judged and never trained."""
+
+    density_kg_m3: float = Field(
+        600.0, gt=0.0, description="Density of the blocks; wood, of which the heaviest has 4 kg."
+    )
+    friction: float = Field(
+        0.5, ge=0.0, description="Of blocks and support each; PyBullet multiplies the two."
+    )
+    standoff_m: float = Field(
+        0.1, gt=0.0, description="The commanded pose is reached straight from so far behind it."
+    )
+    standoff_s: float = Field(0.5, gt=0.0, description="How long that takes.")
+    advance_m: float = Field(
+        0.05, gt=0.0, description="How far the cup looks for the face from where it was sent."
+    )
+    advance_speed_m_s: float = Field(0.05, gt=0.0, description="Speed of the cup on that way.")
+    seal_m: float = Field(
+        0.003, gt=0.0, description="The rim's largest distance to the face that still seals."
+    )
+    vacuum_pa: float = Field(60_000.0, gt=0.0, description="Pressure in the cup below the air's.")
+    cup_friction: float = Field(
+        0.5,
+        gt=0.0,
+        description="Of the cup on the face. The face is upright: friction carries the weight.",
+    )
+    lift_m: float = Field(0.2, gt=0.0, description="How far the block is lifted.")
+    lift_s: float = Field(1.0, gt=0.0, description="How long that takes.")
+    hold_s: float = Field(1.0, ge=0.0, description="How long the block is held up there.")
+
+
 class GraspSettings(BaseModel, frozen=True, extra="forbid"):
     """The grasp task: a KUKA KR 16 brings its suction cup in front of the nearest block."""
 
@@ -180,6 +211,9 @@ class GraspSettings(BaseModel, frozen=True, extra="forbid"):
     goal: Goal = Field(default_factory=Goal, description="Goal region unless a lesson sets it.")
     randomize: Randomize = Field(
         default_factory=Randomize, description="What is drawn at every reset."
+    )
+    pick: Pick = Field(
+        default_factory=Pick, description="The physical pick of `trainers.evaluate --pick`."
     )
 
     @model_validator(mode="after")

@@ -48,6 +48,11 @@ class GoalRegion(Batch):
         )
 
 
+def goal_middle_m(goal: Goal) -> Floats:
+    """The middle (3,) of a goal region, in the block frame."""
+    return np.array([0.0, 0.0, (goal.gap_min_m + goal.gap_limit_m) / 2])
+
+
 @dataclass(frozen=True)
 class Progress(Batch):
     """What has happened in N running episodes; arrays (N,)."""

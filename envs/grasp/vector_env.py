@@ -16,26 +16,19 @@ from numpy.typing import NDArray
 from curricula.samplers import ParameterValue, draw
 from encoders.spaces import DepthImage
 from envs.environment import Environment, Observations, StepResult
-from envs.grasp.camera import Views, sample_views
+from envs.grasp.aims import Aims
+from envs.grasp.album import GraspAlbum
+from envs.grasp.camera import Views, overviews
 from envs.grasp.episodes import Episodes
 from envs.grasp.observations import PRIVILEGED, observation_space, privileged_state
+from envs.grasp.pick import PickCheck, Picker
 from envs.grasp.scene import Scenes, SceneSampler
-from envs.grasp.settings import Camera, GraspSettings
+from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.factory import make_simulator
-from envs.grasp.task import Arm, GoalRegion, Motion, Progress, advance, judge
+from envs.grasp.task import Arm, GoalRegion, Motion, Progress, advance, goal_middle_m, judge
 from rewards.reward import RewardTerm, weigh
 from rewards.transition import Transition
 
-OVERVIEW = Camera(
-    type="rgb",
-    width=640,
-    height=480,
-    fov_deg=62.0,
-    position_m=(2.0, -1.6, 1.6),
-    target_m=(0.7, 0.0, 0.9),
-    near_m=(0.1, 0.1),
-    far_m=(10.0, 10.0),
-)
 GOAL_PARAMETERS = ("lateral_limit_m", "vertical_limit_m", "gap_limit_m", "yaw_limit_deg")
 
 
@@ -135,9 +128,7 @@ class GraspVectorEnv(Environment):
         """Pictures (480, 640, 3) of all environments; None where PyBullet's window shows them."""
         if self.render_mode != "rgb_array":
             return None
-        still = np.random.default_rng(0)
-        views = sample_views(OVERVIEW, still, self.num_envs, position_m=0.0, rotation_deg=0.0)
-        return tuple(self._simulator.render(self._everyone, views))
+        return tuple(self._simulator.render(self._everyone, overviews(self.num_envs)))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the simulator."""
@@ -161,6 +152,17 @@ class GraspVectorEnv(Environment):
         self._simulator.load(self._everyone, episodes.scenes, episodes.tools.joints_rad)
         return self._observations()
 
+    # -- evaluation's interface ------------------------------------------------------------------
+
+    def physical_check(self, *, window: bool = False) -> PickCheck:
+        """The pick; see `Environment.physical_check` and `envs.grasp.pick`."""
+        picker = Picker(self._settings.support, self._settings.pick, window)
+        return PickCheck(picker, self._aims)
+
+    def album(self) -> GraspAlbum:
+        """See `Environment.album`."""
+        return GraspAlbum(self._settings, self._aims)
+
     # -- the task --------------------------------------------------------------------------------
 
     @property
@@ -171,6 +173,18 @@ class GraspVectorEnv(Environment):
     def action_for(self, tooltip_m: NDArray[Any], yaw_rad: NDArray[Any]) -> NDArray[np.float64]:
         """The actions (N, 4) that lead to tooltips (N, 3) and yaws (N,)."""
         return self._arm.action(tooltip_m, yaw_rad)
+
+    def _aims(self, actions: NDArray[Any]) -> Aims:
+        """Where actions (n, 4) would lead in the first n environments."""
+        n, episodes = len(actions), self._running()
+        tooltip_m, yaw_rad = self._arm.pose(np.asarray(actions, np.float64))
+        return Aims(
+            scenes=episodes.scenes[:n],
+            tooltip_m=tooltip_m,
+            yaw_rad=yaw_rad,
+            views={name: views[:n] for name, views in episodes.views.items()},
+            images={name: images[:n] for name, images in episodes.images.items()},
+        )
 
     def _running(self) -> Episodes:
         if self._episodes is None:
@@ -237,9 +251,7 @@ class GraspVectorEnv(Environment):
 
     def _measures(self, transition: Transition) -> dict[str, NDArray[Any]]:
         """What to report: errors to the middle of the final goal region, and how it went."""
-        goal = self._settings.goal
-        middle = np.array([0.0, 0.0, (goal.gap_min_m + goal.gap_limit_m) / 2])
-        error = np.abs(transition.offset_m - middle)
+        error = np.abs(transition.offset_m - goal_middle_m(self._settings.goal))
         return {
             "success": transition.rotation_right,
             "collision": self._running().progress.collided,

@@ -146,9 +146,9 @@ def test_disc_stays_on_a_face_that_is_smaller_than_the_corners_disc(
 
 def test_discs_of_a_hand_computed_block() -> None:
     # Leg 0.1, bar 0.1: r = 0.2 - sqrt(0.02) = 0.058579, in the top corner on the leg's side.
-    left = block(L_SHAPE, leg_share=0.5)
+    left = block(L_SHAPE, leg_share=0.0)
     np.testing.assert_allclose(left.disc_m, [[0.1 - 0.0585786, 0.2 - 0.0585786]], atol=1e-7)
-    right = block(L_SHAPE, leg_share=0.5, on_left=False)
+    right = block(L_SHAPE, leg_share=0.0, on_left=False)
     np.testing.assert_allclose(right.disc_m, left.disc_m * [-1, 1], atol=1e-12)
     np.testing.assert_allclose(block(PARALLELEPIPED, height=0.14).disc_m, [[0.0, 0.07]])
 
@@ -188,8 +188,28 @@ def test_boxes_are_disjoint_and_fill_the_blocks_outline(shape: int) -> None:
         np.testing.assert_allclose(x + half, depth[row])
 
 
+@settings(deadline=None)
+@given(
+    shape=st.sampled_from(SHAPES),
+    width=st.floats(0.12, 0.24),
+    height=st.floats(0.12, 0.24),
+    bar_share=st.floats(0, 1),
+    leg_share=st.floats(0, 1),
+    on_left=st.booleans(),
+)
+def test_blocks_stand_by_themselves(
+    *, shape: int, width: float, height: float, bar_share: float, leg_share: float, on_left: bool
+) -> None:
+    bar = 0.08 + bar_share * max(0.0, height / 2 - 0.08)
+    blocks = block(shape, width=width, height=height, bar=bar, leg_share=leg_share, on_left=on_left)
+    low, high = rectangles(blocks, 0)
+    foot = low[:, 1] < 1e-9
+    # All boxes are equally deep: the centre of mass is the centroid of the face.
+    assert low[foot, 0].min() + 0.005 < blocks.centroid_m[0, 0] < high[foot, 0].max() - 0.005
+
+
 def test_pieces_of_an_l_and_a_u() -> None:
-    # L: leg in [0.4, 0.6] of the width; U: in [0.25, 0.35].
+    # L: leg in [0.5, 0.6] of the width; U: in [0.25, 0.35].
     low, high = rectangles(block(L_SHAPE, leg_share=1.0), 0)
     np.testing.assert_allclose(low, [[-0.1, 0.1], [-0.02, 0.0]], atol=1e-12)
     np.testing.assert_allclose(high, [[0.1, 0.2], [0.1, 0.1]], atol=1e-12)
@@ -203,7 +223,7 @@ def test_pieces_of_an_l_and_a_u() -> None:
 def test_centroids_of_hand_computed_blocks() -> None:
     np.testing.assert_allclose(block(PARALLELEPIPED, height=0.16).centroid_m, [[0.0, 0.08]])
     # L: bar 0.2 x 0.1 at (0, 0.15), leg 0.1 x 0.1 at (0.05, 0.05).
-    np.testing.assert_allclose(block(L_SHAPE).centroid_m, [[0.05 / 3, 0.35 / 3]])
+    np.testing.assert_allclose(block(L_SHAPE, leg_share=0.0).centroid_m, [[0.05 / 3, 0.35 / 3]])
     # U: the same bar, legs 0.06 x 0.1 at z = 0.05.
     np.testing.assert_allclose(
         block(U_SHAPE).centroid_m, [[0.0, (0.02 * 0.15 + 0.012 * 0.05) / 0.032]], atol=1e-12

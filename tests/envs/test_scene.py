@@ -153,7 +153,7 @@ def test_dimensions_of_an_l_use_their_whole_range() -> None:
     scenes, _ = sample(GraspSettings(randomize=Randomize(shapes=("L",))), 300)
     low, high = outline(scenes)
     legs = 2 * scenes.box_half_m[:, :, 1, 1] / (high - low)[..., 1]
-    assert 0.4 <= legs.min() < 0.41
+    assert 0.5 <= legs.min() < 0.51
     assert 0.59 < legs.max() <= 0.6
     bars = 2 * scenes.box_half_m[:, :, 0, 2]
     assert 0.08 <= bars.min() < 0.0805

@@ -172,6 +172,14 @@ class ChoiceEnvironment(ToyEnvironment):
         return (actions != target).astype(float)
 
 
+class RecallEnvironment(ChoiceEnvironment):
+    """The signal is shown at the first step of an episode alone, and holds for all of them."""
+
+    def show(self, target: np.ndarray) -> dict[str, np.ndarray]:
+        shown = super().show(target)["signal"]
+        return {"signal": np.where(self._steps[:, None] == 0, shown, np.float32(0.0))}
+
+
 class PictureEnvironment(ToyEnvironment):
     """Depth images: say where the near bar stands, from -1 at the left to 1 at the right."""
 
@@ -289,6 +297,7 @@ class ToyPlugin:
         return {
             "target": TargetEnvironment,
             "choice": ChoiceEnvironment,
+            "recall": RecallEnvironment,
             "picture": PictureEnvironment,
         }
 

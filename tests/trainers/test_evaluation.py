@@ -10,11 +10,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.spaces import Box
+from torch import Tensor
 
 from trainers.checkpoint import Checkpoints
 from trainers.evaluate import main
+from trainers.observations import Observations
 from trainers.plugins import Registries
+from trainers.ppo import PPO
 from trainers.results import begin
 from trainers.session import Session
 from trainers.settings import RunSettings
@@ -28,6 +32,8 @@ GRASP = {
     "episode_steps": 3,
     "cameras": {"depth": {"type": "depth", "width": 36, "height": 36}},
 }
+REWARDS = [{"type": "approach"}, {"type": "facing"}]
+ENCODERS = {"depth": {"type": "paper", "size": 32}}
 
 
 class Square(gymnasium.Env[Any, Any]):
@@ -117,6 +123,47 @@ def test_episodes_are_repeatable_and_their_seeds_are_not_the_runs(
     assert evaluated[0].isdisjoint(trained | evaluated[2])
 
 
+@pytest.fixture
+def ages(monkeypatch: pytest.MonkeyPatch) -> list[list[float]]:
+    """What a policy that counts its steps remembers, at each of its actions."""
+    ages: list[list[float]] = []
+
+    def count_steps(
+        algorithm: PPO, observations: Observations, *, deterministic: bool
+    ) -> tuple[Tensor, Tensor]:
+        assert observations.sequences is not None
+        state = observations.sequences.state
+        ages.append(state.flatten().tolist())
+        return torch.zeros(len(state), *algorithm.policy.action_head.bias.shape), state + 1.0
+
+    monkeypatch.setattr(PPO, "initial_state", lambda algorithm, count: torch.zeros(count, 1))
+    monkeypatch.setattr(PPO, "act", count_steps)
+    return ages
+
+
+def test_what_is_remembered_ends_with_its_episode(
+    saved: Callable[..., Path], ages: list[list[float]]
+) -> None:
+    report(saved(GYMNASIUM), "--episodes", "40")
+    first_action, *steps = ages
+    assert first_action == [0.0, 0.0]
+    for column in np.array(steps).T:
+        begins = np.flatnonzero(column == 0.0)
+        lengths = np.diff(begins)
+        assert set(lengths) == set(LENGTHS)
+        np.testing.assert_array_equal(
+            column[: begins[-1]], np.concatenate([np.arange(length) for length in lengths])
+        )
+
+
+def test_nothing_is_remembered_at_a_first_action(
+    saved: Callable[..., Path], ages: list[list[float]]
+) -> None:
+    report(saved(GRASP, rewards=REWARDS, encoders=ENCODERS), "--episodes", "6")
+    assert ages[:3] == [[0.0, 0.0]] * 3  # six scenes for two environments
+    assert ages[3:5] == [[0.0, 0.0], [1.0, 1.0]]  # whole episodes
+
+
 def test_the_environment_says_how_many_episodes_it_is_judged_by(
     saved: Callable[..., Path],
 ) -> None:
@@ -126,9 +173,7 @@ def test_the_environment_says_how_many_episodes_it_is_judged_by(
 def test_grasping_is_judged_by_the_first_action_and_by_episodes_as_in_training(
     saved: Callable[..., Path],
 ) -> None:
-    rewards = [{"type": "approach"}, {"type": "facing"}]
-    encoders = {"depth": {"type": "paper", "size": 32}}
-    said = report(saved(GRASP, rewards=rewards, encoders=encoders), "--episodes", "3")
+    said = report(saved(GRASP, rewards=REWARDS, encoders=ENCODERS), "--episodes", "3")
     assert said.keys() >= {"first_action_success", "position_error_m", "yaw_error_deg", "success"}
     assert said.keys() >= {"reward", "reward_std", "episode_length", "collision_rate"}
 

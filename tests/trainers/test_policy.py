@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -18,6 +19,7 @@ from encoders.conv import Conv
 from encoders.spaces import RgbImage
 from trainers.distributions import Categorical, DiagonalGaussian
 from trainers.errors import UserError
+from trainers.memory import Sequences
 from trainers.networks import NetworkFactory
 from trainers.observations import Observations
 from trainers.policy import ActorCritic, FrameFeatures, PolicySettings, to_environment
@@ -106,7 +108,7 @@ def test_a_shared_critic_trains_the_encoders_and_a_separate_one_does_not(
         assert policy.action_head.weight.grad is None
 
 
-@pytest.mark.parametrize("settings", [{}, SEPARATE])
+@pytest.mark.parametrize("settings", [{}, SEPARATE, {"memory": {}}, {**SEPARATE, "memory": {}}])
 def test_actor_and_critic_share_out_all_parameters(
     make_factory: MakeFactory, settings: dict[str, Any]
 ) -> None:
@@ -136,6 +138,54 @@ def test_values_alone_actions_alone_and_both_agree(
     distribution_again, values_again = policy(without_frames, cached)
     assert torch.equal(distribution_again.mean, distribution.mean)
     assert torch.equal(values_again, values)
+
+
+def remembering(make_factory: MakeFactory, **settings: Any) -> tuple[ActorCritic, Observations]:
+    """A policy with an LSTM of 4 units, and two sequences of three and one observations for it."""
+    policy = make_policy(make_factory, memory={"type": "lstm", "memory_size": 4}, **settings)
+    observations = some_observations(2, torch.tensor([1, 0, 1, 1]))
+    sequences = Sequences(torch.tensor([3, 1]), torch.randn(2, policy.state_size))
+    return policy, replace(observations, sequences=sequences)
+
+
+@pytest.mark.parametrize(("settings", "size"), [({}, 8), ({"critic": "separate"}, 16)])
+def test_with_memory_values_alone_actions_alone_and_both_agree(
+    make_factory: MakeFactory, settings: dict[str, Any], size: int
+) -> None:
+    policy, observations = remembering(make_factory, **settings)
+    assert policy.initial_state(5).tolist() == torch.zeros(5, size).tolist()
+    distribution, values, state = policy.step(observations)
+    assert state.shape == (2, size)
+    assert torch.equal(policy.value(observations), values)
+    assert torch.equal(policy.distribution(observations).mean, distribution.mean)
+    assert torch.equal(policy(observations)[1], values)
+    forgetful = replace(observations, sequences=None)
+    first = replace(observations, sequences=Sequences.single(policy.initial_state(4)))
+    assert torch.equal(policy.value(forgetful), policy.value(first))
+    assert not torch.isclose(policy.value(forgetful), values).any()
+
+
+def test_a_separate_critic_remembers_by_itself(make_factory: MakeFactory) -> None:
+    policy, observations = remembering(make_factory, **SEPARATE)
+    distribution, values, state = policy.step(observations)
+    sequences = observations.sequences
+    assert sequences is not None
+    for part, same in ((slice(0, 8), (False, True)), (slice(8, 16), (True, False))):
+        other = sequences.state.clone()
+        other[:, part] += 1.0
+        changed = replace(observations, sequences=replace(sequences, state=other))
+        distribution_now, values_now, _ = policy.step(changed)
+        assert (
+            torch.equal(distribution_now.mean, distribution.mean),
+            torch.equal(values_now, values),
+        ) == same
+    ablated = replace(
+        observations,
+        vectors=observations.vectors | {"privileged": torch.full((4, 2), 9.0)},
+    )
+    state_now = policy.step(ablated)[2]
+    assert torch.equal(state_now[:, :8], state[:, :8])
+    assert not torch.isclose(state_now[:, 8:], state[:, 8:]).any()
 
 
 def test_features_are_replaced_row_by_row() -> None:

@@ -19,13 +19,19 @@ SIDE_PX = 2
 CPU = torch.device("cpu")
 
 
-def rollout_of(frame_index: torch.Tensor, frames: torch.Tensor | None = None) -> Rollout:
-    """A rollout whose only content is its frames; the vector of a transition is its number."""
+def rollout_of(
+    frame_index: torch.Tensor,
+    frames: torch.Tensor | None = None,
+    groups: torch.Tensor | None = None,
+) -> Rollout:
+    """A rollout whose only content is its frames; all else of a transition is its number."""
     numbers = torch.arange(len(frame_index), dtype=torch.float32)
     return Rollout(
         frames={} if frames is None else {"depth": frames},
         frame_index=frame_index,
         vectors={"number": numbers[:, None]},
+        groups=frame_index if groups is None else groups,
+        states=numbers[:, None],
         actions=numbers,
         log_probs=numbers,
         values=numbers,
@@ -110,6 +116,49 @@ def test_minibatches_are_a_partition_in_which_frames_stay_together(
     visited = frame_index[order].tolist()
     runs = 1 + sum(a != b for a, b in pairwise(visited))
     assert runs == len(shares)
+
+
+# Three environments in five steps: episodes end after the second and after the third step.
+SEQUENCES = torch.tensor([0, 1, 2, 0, 1, 2, 3, 1, 2, 3, 4, 2, 3, 4, 2])
+
+
+def test_sequences_come_in_the_order_of_time_with_what_was_remembered_before_them() -> None:
+    rollout = rollout_of(torch.arange(15), groups=SEQUENCES)
+    rows = rollout.in_groups()
+    assert rows.tolist() == [0, 3, 1, 4, 7, 2, 5, 8, 11, 14, 6, 9, 12, 10, 13]
+    sequences = rollout.observations(rows).sequences
+    assert sequences is not None
+    assert sequences.lengths.tolist() == [2, 3, 5, 3, 2]
+    assert sequences.state.flatten().tolist() == [0, 1, 2, 6, 10]
+
+
+@given(st.integers(1, 20), st.integers(0, 2**31))
+def test_a_sequence_is_cut_at_most_where_a_minibatch_ends(size: int, seed: int) -> None:
+    rollout = rollout_of(torch.arange(15), groups=SEQUENCES)
+    batches = list(rollout.minibatches(size, torch.Generator().manual_seed(seed)))
+    pieces = []
+    for rows in batches:
+        sequences = rollout.observations(rows).sequences
+        assert sequences is not None
+        parts = rows.split(sequences.lengths.tolist())
+        assert [part[0] for part in parts] == sequences.state.flatten().tolist()
+        assert len({int(SEQUENCES[part[0]]) for part in parts}) == len(parts)
+        pieces += parts
+    assert len(pieces) <= 5 + len(batches) - 1
+    for number in range(5):
+        whole = torch.cat([piece for piece in pieces if SEQUENCES[piece[0]] == number])
+        assert whole.tolist() == SEQUENCES.eq(number).nonzero().flatten().tolist()
+
+
+def test_a_frame_is_taken_once_wherever_its_sequences_are() -> None:
+    frame_index = torch.tensor([0, 1, 0, 1, 0, 2])
+    groups = torch.tensor([0, 1, 0, 1, 2, 3])  # the first environment's episode is cut in two
+    rollout = rollout_of(frame_index, uint16_frames(1, 2, 3), groups)
+    observations = rollout.observations(torch.tensor([4, 1, 3, 0, 2]))
+    assert observations.frame_index is not None
+    assert len(observations.frames["depth"]) == 2
+    seen = observations.frames["depth"].numpy()[observations.frame_index.numpy()]
+    assert seen[:, 0, 0, 0].tolist() == [1, 2, 2, 1, 1]
 
 
 def test_frames_are_shuffled_anew_in_every_pass() -> None:

@@ -85,9 +85,14 @@ def training(make_run: MakeRun, registries: Registries, tmp_path: Path) -> Calla
     """Builds a `Training` of 16 steps a collection; arguments as `write_run`'s."""
 
     def make(
-        trainer: Any = None, *, stop_at_step: float = np.inf, folder: str = "run", **rest: Any
+        trainer: Any = None,
+        *,
+        environment: Any = "target",
+        stop_at_step: float = np.inf,
+        folder: str = "run",
+        **rest: Any,
     ) -> Training:
-        run = make_run("target", trainer or {}, **rest)
+        run = make_run(environment, trainer or {}, **rest)
         return Training(run, registries, tmp_path / folder, stop_at_step)
 
     return make
@@ -141,11 +146,12 @@ def test_a_stop_before_the_first_step_can_be_taken_up_too(
 
 @pytest.mark.parametrize("ended_by", ["limit", "stop"])
 @pytest.mark.parametrize(
-    ("algorithm", "critic", "own"),
+    ("algorithm", "critic", "memory", "own"),
     [
-        ("ppo", "shared", {"beta_schedule": "constant"}),
-        ("ppo", "separate", {"beta_schedule": "constant"}),
-        ("trpo", "separate", {"fisher_fraction": 0.5}),
+        ("ppo", "shared", None, {"beta_schedule": "constant"}),
+        ("ppo", "separate", None, {"beta_schedule": "constant"}),
+        ("ppo", "separate", {"memory_size": 4}, {"beta_schedule": "constant"}),
+        ("trpo", "separate", None, {"fisher_fraction": 0.5, "normalize_rewards": True}),
     ],
 )
 def test_two_halves_make_the_same_whole(
@@ -153,26 +159,30 @@ def test_two_halves_make_the_same_whole(
     ended_by: str,
     algorithm: str,
     critic: str,
+    memory: dict[str, Any] | None,
     own: dict[str, Any],
 ) -> None:
+    # Where a collection ends, an episode is under way.
+    parts = {"environment": {"type": "target", "episode_steps": 5}, "curriculum": LESSONS}
+
     def trainer(max_steps: int) -> dict[str, Any]:
         return {
             "trainer_type": algorithm,
             "max_steps": max_steps,
             "hyperparameters": {"learning_rate_schedule": "constant", "num_epoch": 2, **own},
-            "network_settings": {"critic": critic, "normalize": True},
+            "network_settings": {"critic": critic, "memory": memory, "normalize": True},
         }
 
-    whole = training(trainer(96), folder="whole", curriculum=LESSONS)
+    whole = training(trainer(96), folder="whole", **parts)
     assert whole.train()
     first = (
-        training(trainer(48), folder="halves", curriculum=LESSONS)
+        training(trainer(48), folder="halves", **parts)
         if ended_by == "limit"
-        else training(trainer(96), folder="halves", curriculum=LESSONS, stop_at_step=52)
+        else training(trainer(96), folder="halves", stop_at_step=52, **parts)
     )
     first.train()
     assert first.saved[-1] == 48
-    second = training(trainer(96), folder="halves", curriculum=LESSONS)
+    second = training(trainer(96), folder="halves", **parts)
     second.resume()
     assert second.train()
     expected, got = whole.checkpoints.load_latest(), second.checkpoints.load_latest()

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
-import os
-import sys
 import time
 from dataclasses import dataclass
 
@@ -15,11 +12,23 @@ from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
 from envs.grasp.camera import Views, focal_length_px, sense_depth
-from envs.grasp.robot import KR16_URDF
 from envs.grasp.scene import Scenes
 from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
-from envs.grasp.simulators.colors import BLOCK_RGBA, SUPPORT_RGBA
+from envs.grasp.simulators.bodies import (
+    UPRIGHT,
+    add_boxes,
+    add_robot,
+    add_support,
+    block_boxes,
+    close_client,
+    open_client,
+    put,
+    set_joints,
+    take_picture,
+    turned,
+)
+from envs.grasp.simulators.colors import BLOCK_RGBA
 
 # A client costs 30 MB whatever it holds, so worlds share them; but every block that is parked while
 # another world has its turn costs some microseconds of each picture.
@@ -27,7 +36,6 @@ CLIENTS_PER_PROCESS = 8
 # PyBullet keeps some 10 kB of every removed body until its whole simulation is reset.
 LOADS_BEFORE_RESET = 400
 PARKED_M = [0.0, 0.0, -1000.0]
-UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 WINDOW_POSE_S = 0.04
 
 
@@ -109,15 +117,8 @@ class _Client:
 
     def __init__(self, support: Support, window: bool):
         self._support = support
-        if window:
-            _require_display()
         self._pause_s = WINDOW_POSE_S if window else 0.0
-        self._id = pybullet.connect(pybullet.GUI if window else pybullet.DIRECT)
-        if window:
-            pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=self._id)
-            pybullet.resetDebugVisualizerCamera(
-                1.6, 50.0, -30.0, (0.9, 0.0, 0.7), physicsClientId=self._id
-            )
+        self._id = open_client(window)
         self._worlds: dict[int, _World] = {}
         self._active: int | None = None
         self._loads = 0
@@ -128,7 +129,7 @@ class _Client:
             for body in self._worlds[slot].blocks:
                 pybullet.removeBody(body, physicsClientId=self._id)
         positions, yaws = scene.block_position_m[0].tolist(), scene.block_yaw_rad[0].tolist()
-        poses = [(position, _turned(yaw)) for position, yaw in zip(positions, yaws, strict=True)]
+        poses = [(position, turned(yaw)) for position, yaw in zip(positions, yaws, strict=True)]
         self._worlds[slot] = _World(scene, joints_rad, [], poses)
         self._active = None if self._active == slot else self._active
         self._loads += 1
@@ -144,10 +145,10 @@ class _Client:
         world = self._worlds[slot]
         touched = collided = False
         for joints_rad in path_rad:
-            self._set_joints(joints_rad)
+            set_joints(self._id, self._robot, joints_rad)
             for number, body in enumerate((*world.blocks, self._table)):
                 for link in self._touching_links(body):
-                    if link == self._cup and number == 0:
+                    if link == self._robot.cup and number == 0:
                         touched = True
                     else:
                         collided = True
@@ -161,81 +162,26 @@ class _Client:
     ) -> tuple[Images, Images]:
         """RGB (H, W, 3) and OpenGL's depth buffer (H, W) of one world."""
         self._activate(slot)
-        scene = self._worlds[slot].scene
-        intensity = float(scene.light_intensity[0])
-        size = (camera.height, camera.width)
-        _, _, rgba, buffer, _ = pybullet.getCameraImage(
-            camera.width,
-            camera.height,
-            view,
-            projection,
-            lightDirection=scene.light_direction[0].tolist(),
-            lightAmbientCoeff=1.0 - intensity,
-            lightDiffuseCoeff=intensity,
-            lightSpecularCoeff=0.0,
-            shadow=0,
-            renderer=pybullet.ER_TINY_RENDERER,
-            flags=pybullet.ER_NO_SEGMENTATION_MASK,
-            physicsClientId=self._id,
-        )
-        return np.reshape(rgba, (*size, 4))[..., :3], np.reshape(buffer, size)
+        return take_picture(self._id, self._worlds[slot].scene, camera, view, projection)
 
     def close(self) -> None:
-        if pybullet.isConnected(self._id):
-            pybullet.disconnect(self._id)
+        close_client(self._id)
 
     def _build(self) -> None:
         """Puts everything into an empty simulation."""
         self._active = None
-        self._robot = pybullet.loadURDF(
-            str(KR16_URDF),
-            useFixedBase=True,
-            flags=pybullet.URDF_USE_IMPLICIT_CYLINDER,  # a hull would dent the cup's rim
-            physicsClientId=self._id,
-        )
-        infos = [
-            pybullet.getJointInfo(self._robot, number, physicsClientId=self._id)
-            for number in range(pybullet.getNumJoints(self._robot, physicsClientId=self._id))
-        ]
-        self._joints = [info[0] for info in infos if info[2] == pybullet.JOINT_REVOLUTE]
-        self._cup = next(info[0] for info in infos if info[12] == b"cup")
-        (x_low, x_high), (y_low, y_high) = self._support.x_m, self._support.y_m
-        low = np.array([x_low, y_low, self._support.top_m - self._support.thickness_m])
-        high = np.array([x_high, y_high, self._support.top_m])
-        self._table = self._add_boxes(np.zeros((1, 3)), (high - low)[None] / 2, SUPPORT_RGBA)
-        self._put(self._table, ((low + high) / 2).tolist(), UPRIGHT)
+        self._robot = add_robot(self._id)
+        self._table = add_support(self._id, self._support)
         for world in self._worlds.values():
             self._add_blocks(world)
 
     def _add_blocks(self, world: _World) -> None:
         """Adds a world's blocks, parked."""
-        scene = world.scene
         world.blocks = []
-        for number in range(scene.box_half_m.shape[1]):
-            used = scene.box_half_m[0, number, :, 0] > 0.0
-            center, half = scene.box_center_m[0, number, used], scene.box_half_m[0, number, used]
+        for number in range(world.scene.box_half_m.shape[1]):
             color = BLOCK_RGBA[number % len(BLOCK_RGBA)]
-            world.blocks.append(self._add_boxes(center, half, color))
-            self._put(world.blocks[-1], PARKED_M, UPRIGHT)
-
-    def _add_boxes(self, center_m: Floats, half_m: Floats, rgba: tuple[float, ...]) -> int:
-        """Adds one fixed body made of boxes (k, 3)."""
-        count, centers, halves = len(half_m), center_m.tolist(), half_m.tolist()
-        collision = pybullet.createCollisionShapeArray(
-            shapeTypes=[pybullet.GEOM_BOX] * count,
-            halfExtents=halves,
-            collisionFramePositions=centers,
-            physicsClientId=self._id,
-        )
-        visual = pybullet.createVisualShapeArray(
-            shapeTypes=[pybullet.GEOM_BOX] * count,
-            halfExtents=halves,
-            visualFramePositions=centers,
-            rgbaColors=[rgba] * count,
-            physicsClientId=self._id,
-        )
-        body: int = pybullet.createMultiBody(0.0, collision, visual, physicsClientId=self._id)
-        return body
+            world.blocks.append(add_boxes(self._id, *block_boxes(world.scene, number), color))
+            put(self._id, world.blocks[-1], PARKED_M, UPRIGHT)
 
     def _activate(self, slot: int) -> None:
         """Parks the blocks of the world before, and puts this one's in place."""
@@ -243,60 +189,19 @@ class _Client:
             return
         if self._active is not None:
             for body in self._worlds[self._active].blocks:
-                self._put(body, PARKED_M, UPRIGHT)
+                put(self._id, body, PARKED_M, UPRIGHT)
         world = self._worlds[slot]
         for body, (position_m, orientation) in zip(world.blocks, world.poses, strict=True):
-            self._put(body, position_m, orientation)
-        self._set_joints(world.joints_rad)
+            put(self._id, body, position_m, orientation)
+        set_joints(self._id, self._robot, world.joints_rad)
         self._active = slot
-
-    def _put(self, body: int, position_m: list[float], orientation: list[float]) -> None:
-        pybullet.resetBasePositionAndOrientation(
-            body, position_m, orientation, physicsClientId=self._id
-        )
-
-    def _set_joints(self, joints_rad: Floats) -> None:
-        pybullet.resetJointStatesMultiDof(
-            self._robot,
-            self._joints,
-            [[angle] for angle in joints_rad.tolist()],
-            physicsClientId=self._id,
-        )
 
     def _touching_links(self, body: int) -> list[int]:
         """Links of the robot that touch or enter a body."""
         points = pybullet.getClosestPoints(
-            self._robot, body, distance=0.0, physicsClientId=self._id
+            self._robot.body, body, distance=0.0, physicsClientId=self._id
         )
         return [point[3] for point in points]
-
-
-def _require_display() -> None:
-    """Asks for the display before PyBullet does, which ends the whole process without one.
-
-    Raises:
-        ValueError: there is no X server at `DISPLAY`.
-    """
-    if not sys.platform.startswith("linux"):
-        return
-    try:
-        x11 = ctypes.CDLL("libX11.so.6")
-    except OSError as error:
-        raise ValueError(f"no window can be opened without the library libX11: {error}") from error
-    x11.XOpenDisplay.restype = ctypes.c_void_p
-    display = x11.XOpenDisplay(None)
-    if not display:
-        where = os.environ.get("DISPLAY")
-        raise ValueError(
-            f"no window can be opened: {f'DISPLAY={where}' if where else 'DISPLAY is not set and'} "
-            "leads to no X server; set it to one that runs, or use render_mode: rgb_array"
-        )
-    x11.XCloseDisplay(ctypes.c_void_p(display))
-
-
-def _turned(yaw_rad: float) -> list[float]:
-    """The quaternion (x, y, z, w) of a turn about the vertical."""
-    return [0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2)]
 
 
 def view_matrices(views: Views) -> list[list[float]]:

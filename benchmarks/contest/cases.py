@@ -1,0 +1,63 @@
+"""What is learned, by whom, and for how long."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+RUN_FILES = Path(__file__).parents[2] / "config" / "gymnasium"
+OURS, PEER = "ventosa", "peer"
+SIDES = (OURS, PEER)
+PEER_NAMES = {
+    "ppo": "Stable-Baselines3 PPO",
+    "trpo": "sb3-contrib TRPO",
+    "ddpg": "Stable-Baselines3 DDPG",
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """An algorithm on a task, for both sides."""
+
+    algorithm: str
+    task: str
+    """As the run files call it."""
+    steps: int
+
+    @property
+    def name(self) -> str:
+        """Both, as in the run file's name."""
+        return f"{self.task}_{self.algorithm}"
+
+    @property
+    def run_file(self) -> Path:
+        """Where the hyper-parameters are, for both sides."""
+        return RUN_FILES / f"{self.name}.yaml"
+
+
+# Fewer steps than the run files have, where two cores would need days for all the seeds.
+CASES = (
+    Case("ppo", "pendulum", 100_000),
+    Case("ppo", "half_cheetah", 200_000),
+    Case("ppo", "hopper", 200_000),
+    Case("trpo", "pendulum", 100_000),
+    Case("trpo", "half_cheetah", 200_000),
+    Case("trpo", "hopper", 200_000),
+    Case("ddpg", "pendulum", 20_000),
+    Case("ddpg", "half_cheetah", 50_000),
+    Case("ddpg", "hopper", 50_000),
+)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of one side."""
+
+    case: Case
+    side: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Of its file of results."""
+        return f"{self.case.name}-{self.case.steps}-{self.side}-{self.seed}"

@@ -1,0 +1,50 @@
+"""This project's side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import closing
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+
+from benchmarks.contest.evaluation import Act, Referee
+from trainers.memory import Sequences
+from trainers.observations import Observations, to_tensors
+from trainers.plugins import Registries
+from trainers.policy import to_environment
+from trainers.session import Session
+from trainers.settings import RunSettings
+
+
+def learn(run: RunSettings, registries: Registries, referee: Referee) -> Act:
+    """Learns as the run file says; returns the final policy."""
+    steps = run.trainer.settings.max_steps  # type: ignore[attr-defined]
+    with closing(Session(run, registries)) as session:
+        session.reset()
+        act = policy_of(session)
+        referee.start()
+        while session.interaction.step_count < steps:
+            progress = session.interaction.step_count / steps
+            session.algorithm.collect()
+            session.algorithm.update(progress)
+            session.interaction.take_finished()
+            referee.look(session.interaction.step_count, act)
+        return act
+
+
+def policy_of(session: Session) -> Act:
+    """The session's deterministic policy, which goes on learning with it."""
+    env = session.interaction.env
+
+    @torch.no_grad()
+    def act(raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        tensors = to_tensors(raw, env.single_observation_space, torch.device("cpu"))
+        count = len(next(iter(raw.values())))
+        state = Sequences.single(session.algorithm.initial_state(count))
+        observations = Observations(tensors.frames, tensors.vectors, sequences=state)
+        actions, _ = session.algorithm.act(observations, deterministic=True)
+        return to_environment(actions, env.single_action_space)
+
+    return act

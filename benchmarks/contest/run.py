@@ -1,0 +1,68 @@
+"""One run of one side, in a process of its own: `python -m benchmarks.contest.run`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+# One thread each: small networks gain nothing from a second, and runs go side by side.
+os.environ["OMP_NUM_THREADS"] = "1"
+
+from benchmarks.contest import ours, theirs
+from benchmarks.contest.cases import OURS, PEER, SIDES, Case, Job
+from benchmarks.contest.evaluation import Referee, returns
+from trainers.files import write_atomically
+from trainers.plugins import load_registries
+from trainers.session import build_environment
+from trainers.settings import load_run
+
+EVALUATION_ENVS = 10
+EVALUATIONS = 20
+FINAL_EPISODES_EACH = 3
+LEARNERS = {OURS: ours.learn, PEER: theirs.learn}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Learns, evaluates, and writes what came out."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.contest.run", description=__doc__)
+    parser.add_argument("algorithm")
+    parser.add_argument("task")
+    parser.add_argument("steps", type=int)
+    parser.add_argument("side", choices=SIDES)
+    parser.add_argument("seed", type=int)
+    parser.add_argument("--to", type=Path, required=True, help="the file of results")
+    options = parser.parse_args(arguments)
+    case = Case(options.algorithm, options.task, options.steps)
+    play(Job(case, options.side, options.seed), options.to)
+    return 0
+
+
+def play(job: Job, path: Path) -> None:
+    """Does one job, and writes its results as JSON."""
+    registries = load_registries()
+    overrides = [f"trainer.max_steps={job.case.steps}", f"seed={job.seed}"]
+    run = load_run(job.case.run_file, overrides, registries)
+    judged = load_run(
+        job.case.run_file, [*overrides, f"environment.num_envs={EVALUATION_ENVS}"], registries
+    )
+    env = build_environment(judged, job.seed)
+    referee = Referee(env, max(1, job.case.steps // EVALUATIONS))
+    act = LEARNERS[job.side](run, registries, referee)
+    seconds = referee.stop()
+    final = returns(env, act, FINAL_EPISODES_EACH)
+    env.close()
+    result = {
+        **asdict(job),
+        "seconds": seconds,
+        "final_return": float(final.mean()),
+        "curve": referee.curve,
+    }
+    write_atomically(path, json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,169 @@
+"""Stable-Baselines3's side, with the hyper-parameters of our run files. Needs the extra `bench`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sb3_contrib import TRPO
+from stable_baselines3 import DDPG, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from benchmarks.contest.evaluation import Act, Referee
+from benchmarks.peers import PeerVecEnv
+from trainers.ddpg import DDPGSettings
+from trainers.networks import ACTIVATIONS, NetworkSettings
+from trainers.plugins import Registries
+from trainers.ppo import PPOSettings
+from trainers.schedules import Schedule
+from trainers.session import build_environment
+from trainers.settings import RunSettings
+from trainers.trpo import TRPOSettings
+
+
+def learn(run: RunSettings, registries: Registries, referee: Referee) -> Act:
+    """Learns with the same environment and hyper-parameters; returns the final policy."""
+    settings = run.trainer.settings
+    env = _normalized(PeerVecEnv(build_environment(run, run.seed)), settings)
+    model = _BUILDERS[type(settings)](settings, env, run.seed)
+    act = _policy_of(model, env)
+    referee.start()
+    model.learn(settings.max_steps, _Watch(referee, act))  # type: ignore[attr-defined]
+    env.close()
+    return act
+
+
+class _Watch(BaseCallback):
+    """Shows the referee the policy after each update."""
+
+    def __init__(self, referee: Referee, act: Act):
+        super().__init__()
+        self._referee, self._act = referee, act
+
+    def _on_rollout_start(self) -> None:
+        self._referee.look(self.num_timesteps, self._act)
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def _normalized(env: VecEnv, settings: Any) -> VecEnv:
+    observations = settings.network_settings.normalize
+    rewards = getattr(settings.hyperparameters, "normalize_rewards", False)
+    if not observations and not rewards:
+        return env
+    gamma = settings.hyperparameters.gamma
+    return VecNormalize(env, norm_obs=observations, norm_reward=rewards, gamma=gamma)
+
+
+def _policy_of(model: BaseAlgorithm, env: VecEnv) -> Act:
+    def act(raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        (observations,) = raw.values()
+        if isinstance(env, VecNormalize):
+            observations = env.normalize_obs(observations)
+        actions, _ = model.predict(observations, deterministic=True)
+        return actions
+
+    return act
+
+
+def _ppo(settings: PPOSettings, env: VecEnv, seed: int) -> PPO:
+    hyper, networks = settings.hyperparameters, settings.network_settings
+    return PPO(
+        "MlpPolicy",
+        env,
+        learning_rate=_course(hyper.learning_rate, hyper.learning_rate_schedule),
+        n_steps=hyper.buffer_size // env.num_envs,
+        batch_size=hyper.batch_size,
+        n_epochs=hyper.num_epoch,
+        gamma=hyper.gamma,
+        gae_lambda=hyper.lambd,
+        clip_range=_course(hyper.epsilon, hyper.epsilon_schedule),
+        clip_range_vf=hyper.value_clipping,
+        ent_coef=hyper.beta,
+        vf_coef=hyper.value_coefficient,
+        max_grad_norm=hyper.max_gradient_norm,
+        target_kl=hyper.target_kl,
+        policy_kwargs=_networks(networks) | _log_std(networks.initial_std, env),
+        seed=seed,
+        device="cpu",
+    )
+
+
+def _trpo(settings: TRPOSettings, env: VecEnv, seed: int) -> TRPO:
+    hyper, networks = settings.hyperparameters, settings.network_settings
+    return TRPO(
+        "MlpPolicy",
+        env,
+        learning_rate=_course(hyper.learning_rate, hyper.learning_rate_schedule),
+        n_steps=hyper.buffer_size // env.num_envs,
+        batch_size=hyper.batch_size,
+        gamma=hyper.gamma,
+        cg_max_steps=hyper.cg_iterations,
+        cg_damping=hyper.damping,
+        line_search_shrinking_factor=hyper.backtrack_coefficient,
+        line_search_max_iter=hyper.backtrack_iterations,
+        n_critic_updates=hyper.num_epoch,
+        gae_lambda=hyper.lambd,
+        target_kl=hyper.delta,
+        sub_sampling_factor=round(1 / hyper.fisher_fraction),
+        policy_kwargs=_networks(networks) | _log_std(networks.initial_std, env),
+        seed=seed,
+        device="cpu",
+    )
+
+
+def _ddpg(settings: DDPGSettings, env: VecEnv, seed: int) -> DDPG:
+    hyper = settings.hyperparameters
+    size = env.action_space.shape or ()
+    return DDPG(
+        "MlpPolicy",
+        env,
+        learning_rate=_course(hyper.learning_rate, hyper.learning_rate_schedule),
+        buffer_size=hyper.buffer_size,
+        learning_starts=hyper.buffer_init_steps,
+        batch_size=hyper.batch_size,
+        tau=hyper.tau,
+        gamma=hyper.gamma,
+        train_freq=1,
+        gradient_steps=round(hyper.updates_per_step * env.num_envs),
+        action_noise=NormalActionNoise(np.zeros(size), np.full(size, hyper.noise.sigma)),
+        policy_kwargs=_networks(settings.network_settings),
+        seed=seed,
+        device="cpu",
+    )
+
+
+_BUILDERS: dict[type, Callable[..., BaseAlgorithm]] = {
+    PPOSettings: _ppo,
+    TRPOSettings: _trpo,
+    DDPGSettings: _ddpg,
+}
+
+
+def _networks(settings: NetworkSettings) -> dict[str, Any]:
+    activation = type(ACTIVATIONS[settings.activation]())
+    return {
+        "net_arch": [settings.hidden_units] * settings.num_layers,
+        "activation_fn": activation,
+        # Ours has the same: one call of a fused kernel instead of one for each tensor.
+        "optimizer_kwargs": {"fused": True},
+        "optimizer_class": torch.optim.Adam,
+    }
+
+
+def _log_std(initial_std: float, env: VecEnv) -> dict[str, float]:
+    continuous = isinstance(env.action_space, gymnasium.spaces.Box)
+    return {"log_std_init": math.log(initial_std)} if continuous else {}
+
+
+def _course(initial: float, schedule: Schedule) -> Callable[[float], float]:
+    return lambda remaining: schedule.value(initial, 1.0 - remaining)
