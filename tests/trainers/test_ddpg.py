@@ -323,12 +323,12 @@ def test_noise_and_random_actions_explore(make_ddpg: MakeDDPG) -> None:
 
     def explored(**hyperparameters: Any) -> Tensor:
         hyper = {"buffer_init_steps": 0, "buffer_size": 4096, "updates_per_step": 1e-9}
-        algorithm = make_ddpg(environment, hyper | hyperparameters)
+        algorithm = make_ddpg(environment, hyper | hyperparameters, time_horizon=8)
         with torch.no_grad():
             for parameter in algorithm.policy.online.actor_parameters():
                 parameter.zero_()
         one_round(algorithm)
-        return algorithm._buffer.actions(np.arange(1024))
+        return algorithm._buffer.actions(np.arange(8 * 256))
 
     quiet = explored(noise={"type": "gaussian", "sigma": 0.0})
     assert (quiet == 0.0).all()
@@ -339,8 +339,10 @@ def test_noise_and_random_actions_explore(make_ddpg: MakeDDPG) -> None:
     assert random.float().mean() == pytest.approx(0.25, abs=0.05)
     assert mixed[random].std() == pytest.approx(1.0 / math.sqrt(3.0), abs=0.05)
     drift = explored(noise={"type": "ornstein_uhlenbeck", "sigma": 0.1})
-    steps = drift.reshape(4, 256, 2).std(dim=(1, 2))
-    assert (steps.diff() > 0.0).all()  # it builds up within the episode of four steps
+    steps = drift.reshape(2, 4, 512).std(dim=2)
+    assert (steps.diff(dim=1) > 0.0).all()  # it builds up within an episode of four steps
+    assert steps[1] == pytest.approx(steps[0], rel=0.15)  # and anew in the next one
+    assert explored(noise={"type": "gaussian", "sigma": 9.0}).abs().max() == 1.0
 
 
 def test_noise_falls_along_its_schedule(make_ddpg: MakeDDPG) -> None:
@@ -400,6 +402,13 @@ def test_update_needs_a_collection_of_its_own(make_ddpg: MakeDDPG) -> None:
     one_round(algorithm)
     with pytest.raises(RuntimeError, match="after collect"):
         algorithm.update(0.0)
+
+
+def test_a_collection_that_is_begun_again_is_learned_from_once(make_ddpg: MakeDDPG) -> None:
+    algorithm = make_ddpg()
+    algorithm.collect()
+    one_round(algorithm)
+    assert len(algorithm._buffer) == 16
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_before_the_weights_change(
