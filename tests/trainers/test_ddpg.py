@@ -355,16 +355,17 @@ def test_noise_falls_along_its_schedule(make_ddpg: MakeDDPG) -> None:
     assert one_round(algorithm, 0.25)["Policy/Noise"] == pytest.approx(0.3)
     assert algorithm._sigma(0.5) == pytest.approx(0.2)
     # Evaluation draws with the noise of the run's end, of which nothing is left here.
-    first = algorithm.act(observations, deterministic=False)
-    assert torch.equal(first, algorithm.act(observations, deterministic=True))
+    first, _ = algorithm.act(observations, deterministic=False)
+    assert torch.equal(first, algorithm.act(observations, deterministic=True)[0])
 
 
 def test_evaluation_draws_with_noise_only_where_it_is_asked_to(make_ddpg: MakeDDPG) -> None:
     algorithm = make_ddpg("target", {"noise": {"type": "gaussian", "sigma": 0.2}})
     observations = Observations({}, {"goal": torch.zeros(5_000, 2)})
-    best = algorithm.act(observations, deterministic=True)
-    assert torch.equal(best, algorithm.act(observations, deterministic=True))
-    drawn = algorithm.act(observations, deterministic=False)
+    best, state = algorithm.act(observations, deterministic=True)
+    assert state.shape == algorithm.initial_state(5_000).shape == (5_000, 0)
+    assert torch.equal(best, algorithm.act(observations, deterministic=True)[0])
+    drawn, _ = algorithm.act(observations, deterministic=False)
     assert (drawn - best).std() == pytest.approx(0.2, abs=0.01)
     assert drawn.abs().max() <= 1.0
 
