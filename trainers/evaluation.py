@@ -32,6 +32,7 @@ from trainers.settings import RunSettings, load_run
 # Run files take seeds below this, so that no run was ever trained on an evaluation's scenes.
 FIRST_SEED = 2**32
 FIRST_ACTION, WHOLE_EPISODE = 0, 1
+POSITION_ERROR = "position_error_m"
 
 
 def evaluate(
@@ -217,6 +218,8 @@ def _first_actions(
             album.add(asked_for, outcomes[-1])
         *_, infos = env.step(actions)
         measures.append(infos.get("measures", {}))
+        if POSITION_ERROR not in measures[-1]:
+            return {}  # it is not the first action that counts here
     return {**_errors(_joined(measures, episodes)), **_picks(_joined(outcomes, episodes))}
 
 
@@ -225,13 +228,11 @@ def _joined(parts: Sequence[dict[str, NDArray[Any]]], rows: int) -> dict[str, ND
 
 
 def _errors(measures: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    if "position_error_m" not in measures:
-        return {}
     return {
         "first_action_success": float(measures[SUCCESS].mean()),
         "collision_rate": float(measures["collision"].mean()),
         "position_error_m": {
-            **_median_and_p95(measures["position_error_m"]),
+            **_median_and_p95(measures[POSITION_ERROR]),
             **{axis: float(np.median(measures[f"position_error_{axis}_m"])) for axis in "xyz"},
         },
         "yaw_error_deg": _median_and_p95(measures["yaw_error_deg"]),

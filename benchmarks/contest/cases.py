@@ -38,14 +38,14 @@ class Case:
 # Fewer steps than the run files have, where two cores would need days for all the seeds.
 CASES = (
     Case("ppo", "pendulum", 100_000),
-    Case("ppo", "half_cheetah", 200_000),
-    Case("ppo", "hopper", 200_000),
+    Case("ppo", "half_cheetah", 100_000),
+    Case("ppo", "hopper", 100_000),
     Case("trpo", "pendulum", 100_000),
-    Case("trpo", "half_cheetah", 200_000),
-    Case("trpo", "hopper", 200_000),
+    Case("trpo", "half_cheetah", 100_000),
+    Case("trpo", "hopper", 100_000),
     Case("ddpg", "pendulum", 20_000),
-    Case("ddpg", "half_cheetah", 50_000),
-    Case("ddpg", "hopper", 50_000),
+    Case("ddpg", "half_cheetah", 30_000),
+    Case("ddpg", "hopper", 30_000),
 )
 
 

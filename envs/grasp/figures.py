@@ -13,11 +13,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from envs.grasp.album import Judged, Shot, outcome_label
 from envs.grasp.camera import project
 from envs.grasp.pick import CUP_RADIUS_M, Outcome
 from envs.grasp.scene import heading
 from envs.grasp.settings import Goal
+from envs.grasp.shots import Judged, Shot, outcome_label
 
 Floats = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from envs.grasp.album import Shot
 from envs.grasp.camera import overviews
 from envs.grasp.pick import STEP_S, Attempt, Picker
 from envs.grasp.settings import Pick, Support
+from envs.grasp.shots import Shot
 
 WIDTH_PX, HEIGHT_PX, CAPTION_PX = 480, 360, 28
 # GIF counts in hundredths of a second.
