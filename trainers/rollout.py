@@ -92,16 +92,22 @@ class Rollout:
         Args:
             rows: (B,) in an order that `minibatches` or `in_groups` gives.
         """
-        frames, index = self.frame_index[rows], None
-        distinct, place = frames.unique(return_inverse=True)
-        if len(distinct) < len(frames):
-            frames, index = distinct, place
-        chosen = {name: take(tensor, frames) for name, tensor in self.frames.items()}
+        chosen, index = self._frames_of(rows)
         vectors = {name: values[rows] for name, values in self.vectors.items()}
         _, lengths = self.groups[rows].unique_consecutive(return_counts=True)
         first = rows[lengths.cumsum(0) - lengths]
         sequences = Sequences(lengths.cpu(), self.states[first])
         return Observations(chosen, vectors, index, sequences)
+
+    def _frames_of(self, rows: Tensor) -> tuple[dict[str, Tensor], Tensor | None]:
+        """The frames of some rows; where rows share them each once, and which is whose."""
+        if not self.frames:
+            return {}, None
+        frames, index = self.frame_index[rows], None
+        distinct, place = frames.unique(return_inverse=True)
+        if len(distinct) < len(frames):
+            frames, index = distinct, place
+        return {name: take(tensor, frames) for name, tensor in self.frames.items()}, index
 
     def in_groups(self) -> Tensor:
         """All rows (M,), those of one group side by side and in the order of time."""

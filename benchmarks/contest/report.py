@@ -146,9 +146,7 @@ def _draw_band(axis: Any, runs: Sequence[Result], steps: int, side: str, algorit
 
 
 def _interpolated(run: Result, at: NDArray[np.float64]) -> NDArray[np.float64]:
-    end = run["case"]["steps"]
-    before = [point for point in run["curve"] if point[0] < end]
-    steps, means = zip(*before, (end, run["final_return"]), strict=True)
+    steps, means = zip(*run["curve"], strict=True)
     return np.asarray(np.interp(at, steps, means))
 
 
