@@ -102,7 +102,7 @@ class ReplayBuffer:
             self._keep_vectors(here, observations)
         self._actions[here], self._rewards[here] = actions, step.reward
         self._terminated[here] = step.terminated
-        self._done[here] = step.terminated | step.truncated
+        self._done[here] = step.done
         self._keep_final(here, observations, step)
         self._row = (self._row + 1) % self._rows
         there = self._places(self._row)

@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.contest.evaluation import Act, Referee
-from trainers.memory import Sequences
-from trainers.observations import Observations, to_tensors
+from trainers.observations import to_tensors
 from trainers.plugins import Registries
 from trainers.policy import to_environment
 from trainers.session import Session
@@ -40,10 +39,7 @@ def policy_of(session: Session) -> Act:
 
     @torch.no_grad()
     def act(raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        tensors = to_tensors(raw, env.single_observation_space, torch.device("cpu"))
-        count = len(next(iter(raw.values())))
-        state = Sequences.single(session.algorithm.initial_state(count))
-        observations = Observations(tensors.frames, tensors.vectors, sequences=state)
+        observations = to_tensors(raw, env.single_observation_space, torch.device("cpu"))
         actions, _ = session.algorithm.act(observations, deterministic=True)
         return to_environment(actions, env.single_action_space)
 
