@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from encoders.conv import Conv, Paper
+from encoders.keypoints import Keypoints
 from encoders.ml_agents import FullyConnected, NatureCnn, ResNet, Simple
 from encoders.vector import Vector
 from trainers.hookspecs import hookimpl
@@ -18,5 +19,6 @@ def ventosa_encoders() -> dict[str, type]:
         "nature_cnn": NatureCnn,
         "resnet": ResNet,
         "fully_connected": FullyConnected,
+        "keypoints": Keypoints,
         "vector": Vector,
     }

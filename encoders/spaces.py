@@ -33,6 +33,8 @@ class DepthImage(Box):
         width: Columns of the image.
         range_m: Nearest and farthest depth of the camera, in metres.
         encoding: What one number of the image stands for.
+        focal_length_px: Of the pinhole camera, whose axis goes through the image's middle, for
+            encoders that need to know it; None where it is unknown.
 
     Raises:
         ValueError: The size, the range or the encoding makes no sense.
@@ -44,6 +46,7 @@ class DepthImage(Box):
         width: int,
         range_m: tuple[float, float] = (0.4, 2.0),
         encoding: DepthEncoding = "uint16",
+        focal_length_px: float | None = None,
     ) -> None:
         if encoding not in ("uint8", "uint16"):
             raise ValueError(f"depth encoding {encoding!r} is unknown: use 'uint16' or 'uint8'")
@@ -58,10 +61,15 @@ class DepthImage(Box):
                 f"a depth of {max_m} m does not fit in uint16 millimetres, which end at "
                 f"{UINT16_MAX / MM_PER_M} m: lower the range's end or use the encoding 'uint8'"
             )
+        if focal_length_px is not None and not 0 < focal_length_px < np.inf:
+            raise ValueError(
+                f"a focal length of {focal_length_px} pixels must be finite and over 0"
+            )
         high, dtype = (UINT8_MAX, np.uint8) if encoding == "uint8" else (UINT16_MAX, np.uint16)
         super().__init__(0, high, shape=(height, width, 1), dtype=dtype)
         self.range_m = (min_m, max_m)
         self.encoding = encoding
+        self.focal_length_px = focal_length_px
 
     def encode(self, metres: NDArray[np.floating]) -> NDArray[np.integer]:
         """Encodes depths as the camera would.
@@ -112,11 +120,15 @@ class DepthImage(Box):
     def __repr__(self) -> str:
         """Says what the numbers mean, where a Box would list its bounds."""
         height, width, _ = self.shape
-        return f"DepthImage({height}, {width}, range_m={self.range_m}, encoding={self.encoding!r})"
+        camera = "" if self.focal_length_px is None else f", focal_length_px={self.focal_length_px}"
+        return (
+            f"DepthImage({height}, {width}, range_m={self.range_m}, encoding={self.encoding!r}"
+            f"{camera})"
+        )
 
     @property
-    def _key(self) -> tuple[tuple[float, float], str]:
-        return self.range_m, self.encoding
+    def _key(self) -> tuple[tuple[float, float], str, float | None]:
+        return self.range_m, self.encoding, self.focal_length_px
 
 
 class RgbImage(Box):

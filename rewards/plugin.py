@@ -1,7 +1,7 @@
 """The rewards that ventosa brings along."""
 
 from rewards.events import Collision, Position, Rotation, Sparse, Touch
-from rewards.shaping import Approach, Facing
+from rewards.shaping import Approach, Facing, Precision
 from trainers.hookspecs import hookimpl
 
 
@@ -15,5 +15,6 @@ def ventosa_rewards() -> dict[str, type]:
         "rotation": Rotation,
         "approach": Approach,
         "facing": Facing,
+        "precision": Precision,
         "sparse": Sparse,
     }

@@ -66,6 +66,45 @@ class Facing:
         return -self._settings.gain * _dot(transition.target_normal, transition.tool_axis)
 
 
+class Precision:
+    """Pays exactness: -gain * sum_i log(1 + (e_i / s_i)^2) / 2 over four errors e_i.
+
+    The errors are those sideways, up, in the gap (to the goal's `gap_m`) and in yaw. Well over its
+    scale s_i an error costs its logarithm: halving it pays the same whether it is large or small,
+    so that the gradient does not fade as a policy becomes exact, and one hopeless scene does not
+    outweigh the others. It is also why exploration settles at about the size of the errors: seen
+    from further away than its own width the logarithm is convex (wider noise pays), nearer it is
+    concave (narrower noise does).
+    """
+
+    class Settings(BaseModel, frozen=True, extra="forbid"):
+        """Settings of the reward `precision`."""
+
+        gain: FiniteFloat = Field(
+            default=0.1, ge=0, description="Reward for making one error smaller by a factor of e."
+        )
+        position_scale_m: FiniteFloat = Field(
+            default=0.005, gt=0, description="Errors of position well below this cost nothing."
+        )
+        yaw_scale_deg: FiniteFloat = Field(
+            default=1.0, gt=0, description="Errors of yaw well below this cost nothing."
+        )
+        gap_m: FiniteFloat = Field(
+            default=0.015, description="The gap between cup and face that has no error."
+        )
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+
+    def __call__(self, transition: Transition) -> NDArray[np.float64]:
+        """Return the rewards, (N,), never positive."""
+        settings = self._settings
+        offset = (transition.offset_m - [0.0, 0.0, settings.gap_m]) / settings.position_scale_m
+        yaw = transition.yaw_error_rad / np.radians(settings.yaw_scale_deg)
+        errors = np.column_stack([offset, yaw])
+        return np.asarray(-0.5 * settings.gain * np.log1p(errors**2).sum(axis=1))
+
+
 def _dot(left: NDArray, right: NDArray) -> NDArray[np.float64]:
     """Return the inner products, (N,), of two arrays of vectors, (N, 3)."""
     return np.einsum("ni,ni->n", left, right, dtype=np.float64)

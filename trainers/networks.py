@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import gymnasium
@@ -145,7 +146,7 @@ class Network(nn.Module):
     def update_statistics(self, vectors: Mapping[str, Tensor]) -> None:
         """Shows vectors (B, n) to the encoders that standardise."""
         for name, encoder in self.vector_encoders.items():
-            if isinstance(encoder, Standardizing):
+            if name in vectors and isinstance(encoder, Standardizing):
                 encoder.update_statistics(vectors[name])
 
 
@@ -186,18 +187,26 @@ class NetworkFactory:
         settings: NetworkSettings,
         names: Sequence[str],
         memory: MemorySettings | None = None,
+        also: Mapping[str, gymnasium.Space[Any]] = MappingProxyType({}),
     ) -> Network:
         """A new network on some of the observations.
+
+        Args:
+            settings: what follows the encoders.
+            names: of the observations.
+            memory: what follows the trunk, if anything.
+            also: spaces of vectors that are no observations of the environment, by name.
 
         Raises:
             UserError: an encoder does not fit its observation.
         """
-        spaces = {name: self.observation_space[name] for name in names}
-        encoders = {name: self._encoder(name, settings) for name in names}
+        spaces = {name: self.observation_space[name] for name in names} | dict(also)
+        encoders = {name: self._encoder(name, space, settings) for name, space in spaces.items()}
         return Network(encoders, spaces, settings, memory)
 
-    def _encoder(self, name: str, settings: NetworkSettings) -> nn.Module:
-        space = self.observation_space[name]
+    def _encoder(
+        self, name: str, space: gymnasium.Space[Any], settings: NetworkSettings
+    ) -> nn.Module:
         component = self._encoders.get(name) or self._defaults(space, settings)
         try:
             encoder: nn.Module = component.cls(space, component.settings)

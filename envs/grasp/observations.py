@@ -10,6 +10,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage, RgbImage
+from envs.grasp.camera import focal_length_px
 from envs.grasp.episodes import Episodes
 from envs.grasp.settings import GraspSettings
 
@@ -25,7 +26,13 @@ def observation_space(settings: GraspSettings) -> gymnasium.spaces.Dict:
     spaces: dict[str, gymnasium.Space[Any]] = {}
     for name, camera in settings.cameras.items():
         if camera.type == "depth":
-            spaces[name] = DepthImage(camera.height, camera.width, camera.range_m, camera.encoding)
+            spaces[name] = DepthImage(
+                camera.height,
+                camera.width,
+                camera.range_m,
+                camera.encoding,
+                focal_length_px(camera),
+            )
         else:
             spaces[name] = RgbImage(camera.height, camera.width)
     if settings.privileged:

@@ -1,0 +1,150 @@
+"""The encoder ``keypoints``: a depth image as the 3-D places it consists of."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from gymnasium.spaces import Box
+from pydantic import BaseModel, Field, PositiveInt
+from torch import nn
+from torch.nn import functional as F
+
+from encoders.layers import dense
+from encoders.spaces import DepthImage
+
+# Coordinates are decimetres, so that the size of a block is near 1.
+UNITS_PER_M = 10.0
+KEYPOINT_SCALE = 1.0 / 3.0
+LARGEST_COVARIANCE = 3.0
+# Sharp enough at the start that no two keypoints are the mean of all points.
+ATTENTION_GAIN = 4.0
+UNSEEN = -1e4  # the logit of what the camera does not see
+COORDINATES = 3
+MOMENTS = 6
+
+
+class Keypoints(nn.Module):
+    """Encoder ``keypoints``: depth -> points -> attention -> keypoints in the camera's frame.
+
+    The image is looked at in overlapping patches. Each is described by its shape, which is its
+    depths relative to that of its middle, clipped so that an edge is an edge however far the
+    background, and by where its middle is: the 3-D point that the camera's intrinsics give. What
+    lies beyond the camera's range is no point and gets no attention. Each of K attention maps (a
+    softmax over all patches, as in spatial soft-argmax: Levine et al. 2016, arXiv:1504.00702)
+    yields the mean of the points it attends to, their covariance (which tells the orientation of
+    the surface), and the mean of some learned features.
+
+    Attributes:
+        features_dim: K times (3 + 6 + `values`).
+
+    Raises:
+        ValueError: The space holds no depth images, does not know its camera, or has images
+            smaller than a patch.
+    """
+
+    class Settings(BaseModel, frozen=True, extra="forbid"):
+        """Settings of the encoder ``keypoints``."""
+
+        keypoints: PositiveInt = Field(24, description="Attention maps, each with a keypoint.")
+        patch: int = Field(8, ge=2, description="Side of a patch in pixels.")
+        stride: PositiveInt = Field(4, description="Pixels from one patch to the next.")
+        hidden_units: PositiveInt = Field(
+            48, description="Units of the two layers that describe a patch."
+        )
+        values: PositiveInt = Field(
+            8, description="Learned features that a keypoint gathers beside its place."
+        )
+        clip_m: float = Field(
+            0.05, gt=0.0, description="Depths in a patch count up to so far from its middle's."
+        )
+
+    def __init__(self, space: Box, settings: Settings) -> None:
+        super().__init__()
+        self.space = _known_camera(space)
+        height, width, _ = space.shape
+        if min(height, width) < settings.patch:
+            raise ValueError(
+                f"a {width}x{height} image (width x height) is smaller than a patch of "
+                f"{settings.patch} pixels: use a larger image or a smaller patch"
+            )
+        self._patch, self._stride = settings.patch, settings.stride
+        self._clip_m = settings.clip_m
+        self._padding = max(settings.patch - settings.stride, 0) // 2
+        hidden, count = settings.hidden_units, settings.keypoints
+        self.shape = dense(settings.patch**2, hidden, "relu")
+        self.place = dense(hidden + COORDINATES, hidden, "relu")
+        self.attention = nn.Linear(hidden, count)
+        nn.init.normal_(self.attention.weight, std=ATTENTION_GAIN / math.sqrt(hidden))
+        nn.init.zeros_(self.attention.bias)
+        self.values = nn.Linear(hidden, settings.values)
+        self.features_dim = count * (COORDINATES + MOMENTS + settings.values)
+        self.rays: torch.Tensor
+        self.register_buffer("rays", self._middles(_rays(self.space)), persistent=False)
+        min_m, max_m = self.space.range_m
+        self._middle_m = math.sqrt(min_m * max_m)
+
+    def forward(self, raw: torch.Tensor) -> torch.Tensor:
+        """Raw depth images (B, H, W, 1) -> features (B, features_dim) float32."""
+        with torch.no_grad():
+            depth_m = self.space.decode(raw)[..., 0]
+            shapes, points, seen = self._look(depth_m)
+        described = self.place(torch.cat([self.shape(shapes), points], dim=-1))
+        logits = self.attention(described).masked_fill(~seen[..., None], UNSEEN)
+        with torch.autocast(raw.device.type, enabled=False):
+            attention = logits.float().softmax(dim=1).transpose(1, 2)
+            return torch.cat(self._gather(attention, points, self.values(described.float())), 1)
+
+    def _look(self, depth_m: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Depths (B, H, W) -> patches' shapes (B, n, p * p), middles (B, n, 3), seen (B, n)."""
+        padded = F.pad(depth_m[:, None], (self._padding,) * 4, mode="replicate")[:, 0]
+        patches = padded.unfold(1, self._patch, self._stride).unfold(2, self._patch, self._stride)
+        middle_m = patches[..., self._patch // 2, self._patch // 2]
+        shapes = (patches - middle_m[..., None, None]).mul_(1.0 / self._clip_m).clamp_(-1.0, 1.0)
+        points = middle_m[..., None] * self.rays
+        points[..., 2] -= self._middle_m
+        seen = middle_m < self.space.range_m[1]
+        return (
+            shapes.flatten(3).flatten(1, 2),
+            points.mul_(UNITS_PER_M).flatten(1, 2),
+            seen.flatten(1),
+        )
+
+    def _gather(
+        self, attention: torch.Tensor, points: torch.Tensor, values: torch.Tensor
+    ) -> list[torch.Tensor]:
+        """What K maps (B, K, n) attend to: mean points, their covariances, mean values."""
+        rows, columns = torch.triu_indices(COORDINATES, COORDINATES, device=points.device)
+        squares = points[..., rows] * points[..., columns]
+        means = attention @ torch.cat([points, squares, values], dim=-1)
+        place, square, value = means.split([COORDINATES, MOMENTS, values.shape[-1]], dim=-1)
+        # Cov(x, y) = E[x y] - E[x] E[y]
+        covariance = square - place[..., rows] * place[..., columns]
+        bounded = covariance.clamp(-LARGEST_COVARIANCE, LARGEST_COVARIANCE)
+        return [(place * KEYPOINT_SCALE).flatten(1), bounded.flatten(1), value.flatten(1)]
+
+    def _middles(self, pixels: torch.Tensor) -> torch.Tensor:
+        """What (H, W, 3) is at the middles of the patches, (h, w, 3)."""
+        padded = F.pad(pixels.permute(2, 0, 1), (self._padding,) * 4, mode="replicate")
+        patches = padded.unfold(1, self._patch, self._stride).unfold(2, self._patch, self._stride)
+        return patches[..., self._patch // 2, self._patch // 2].permute(1, 2, 0).contiguous()
+
+
+def _known_camera(space: Box) -> DepthImage:
+    if not isinstance(space, DepthImage):
+        raise ValueError("only depth images (encoders.spaces.DepthImage) can be turned into points")
+    if space.focal_length_px is None:
+        raise ValueError(
+            "the depth image does not know its camera: declare its DepthImage with focal_length_px"
+        )
+    return space
+
+
+def _rays(space: DepthImage) -> torch.Tensor:
+    """(H, W, 3) the points at depth 1 that pixels' centres see: x right, y down, z forward."""
+    assert space.focal_length_px is not None
+    height, width, _ = space.shape
+    rows = (torch.arange(height) + 0.5 - height / 2) / space.focal_length_px
+    columns = (torch.arange(width) + 0.5 - width / 2) / space.focal_length_px
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
