@@ -27,6 +27,7 @@ def test_all_built_in_encoders_are_registered():
         "nature_cnn",
         "resnet",
         "fully_connected",
+        "keypoints",
         "vector",
     }
 
@@ -44,7 +45,7 @@ def test_contract(name):
             setattr(settings, field, 1)
     with pytest.raises(ValidationError, match="extra"):
         encoder.Settings(**required, no_such_setting=1)
-    space = Box(-1, 1, (6,)) if name == "vector" else DepthImage(80, 80)
+    space = Box(-1, 1, (6,)) if name == "vector" else DepthImage(80, 80, focal_length_px=99.0)
     built = encoder(space, settings)
     assert isinstance(built, nn.Module)
     assert isinstance(built.features_dim, int)

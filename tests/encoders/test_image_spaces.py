@@ -104,6 +104,7 @@ def test_copies_keep_their_meaning(duplicate):
 def test_spaces_of_other_range_or_encoding_differ():
     assert DepthImage(2, 3) != DepthImage(2, 3, (0.4, 3.0))
     assert DepthImage(2, 3) != DepthImage(2, 3, encoding="uint8")
+    assert DepthImage(2, 3) != DepthImage(2, 3, focal_length_px=5.0)
     assert DepthImage(2, 3) != DepthImage(3, 2)
 
 
@@ -123,6 +124,8 @@ def test_rgb_is_bytes_with_three_channels():
         ({"range_m": (0.4, 66.0)}, r"66.0 m .* 65.535 m"),
         ({"encoding": "uint32"}, "'uint32'.*'uint16'"),
         ({"height": 0}, "3x0"),
+        ({"focal_length_px": 0.0}, "focal length of 0.0 pixels"),
+        ({"focal_length_px": float("inf")}, "focal length of inf pixels"),
     ],
 )
 def test_senseless_depth_cameras_are_refused(arguments, message):

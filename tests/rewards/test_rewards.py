@@ -224,3 +224,40 @@ def test_settings_describe_every_field_and_survive_a_dump():
         settings = reward.Settings()
         assert all(field.description for field in reward.Settings.model_fields.values())
         assert reward.Settings.model_validate(settings.model_dump(mode="json")) == settings
+
+
+def off_by(offset_m, yaw_deg):
+    return replace(
+        still(),
+        offset_m=np.array([offset_m], dtype=float),
+        yaw_error_rad=np.radians([yaw_deg]),
+    )
+
+
+@pytest.mark.parametrize(
+    ("offset_m", "yaw_deg", "expected"),
+    [
+        ((0.0, 0.0, 0.015), 0.0, 0.0),
+        ((0.005, 0.0, 0.015), 0.0, -0.1 * np.log(2) / 2),
+        ((0.0, -0.005, 0.020), -1.0, -0.1 * 3 * np.log(2) / 2),
+        ((0.0, 0.0, 0.015), 3.0, -0.1 * np.log(10) / 2),
+    ],
+)
+def test_precision_by_hand(offset_m, yaw_deg, expected):
+    (value,) = make("precision")(off_by(offset_m, yaw_deg))
+    assert value == pytest.approx(expected)
+
+
+@given(st.floats(0.1, 1.0), st.sampled_from([0, 1, 2]))
+def test_halving_a_large_error_pays_the_same_however_large(error_m, axis):
+    def pay(size_m):
+        offset_m = np.array([0.0, 0.0, 0.015])
+        offset_m[axis] += size_m
+        return make("precision", position_scale_m=1e-4)(off_by(offset_m, 0.0))[0]
+
+    assert pay(error_m / 2) - pay(error_m) == pytest.approx(0.1 * np.log(2), rel=1e-3)
+
+
+def test_precision_knows_the_goal_it_is_told():
+    reward = make("precision", gap_m=0.03, gain=1.0, yaw_scale_deg=2.0)
+    assert reward(off_by((0.0, 0.0, 0.03), 2.0))[0] == pytest.approx(-np.log(2) / 2)

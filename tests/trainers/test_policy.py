@@ -279,3 +279,42 @@ def test_actions_are_clipped_to_the_box_and_left_alone_otherwise() -> None:
     actions = torch.tensor([[-3.0, -3.0], [0.5, 0.25], [3.0, 3.0]])
     assert to_environment(actions, space).tolist() == [[-1.0, 0.0], [0.5, 0.25], [1.0, 0.5]]
     assert to_environment(torch.tensor([2, 0]), Discrete(3)).tolist() == [2, 0]
+
+
+SEEING = SEPARATE | {"critic_sees_action": True}
+
+
+def test_a_critic_sees_what_the_policy_would_do(make_factory: MakeFactory) -> None:
+    """What the policy alone sees changes the value, by way of the action and of nothing else."""
+    policy = make_policy(make_factory, **SEEING)
+    nn.init.normal_(policy.action_head.weight)
+    observations = some_observations(4)
+    other = replaced(observations, "joints", torch.randn(4, 3))
+    assert not torch.allclose(policy(observations)[1], policy(other)[1])
+    nn.init.zeros_(policy.action_head.weight)
+    torch.testing.assert_close(policy(observations)[1], policy(other)[1])
+
+
+def test_a_critic_that_sees_the_action_does_not_train_the_policy(make_factory: MakeFactory) -> None:
+    policy = make_policy(make_factory, **SEEING)
+    policy.value(some_observations(4)).sum().backward()
+    assert all(parameter.grad is None for parameter in policy.actor_parameters())
+    assert all(parameter.grad is not None for parameter in policy.critic_parameters())
+
+
+def test_a_critic_that_sees_the_action_agrees_with_itself(make_factory: MakeFactory) -> None:
+    policy = make_policy(make_factory, **SEEING)
+    nn.init.normal_(policy.action_head.weight)
+    observations = some_observations(4, torch.tensor([0, 0, 3, 2]))
+    features = policy.encode_frames(observations).rows(torch.tensor([0, 0, 3, 2]))
+    values = policy(observations)[1]
+    torch.testing.assert_close(policy.value(observations), values)
+    torch.testing.assert_close(policy.value(observations, features), values)
+    policy.update_statistics(observations.vectors)  # which hold no action
+
+
+def test_only_actions_that_are_vectors_can_be_seen(make_factory: MakeFactory) -> None:
+    with pytest.raises(UserError, match=r"critic_sees_action: .*Discrete"):
+        ActorCritic(make_factory(SPACE, CONV, Discrete(3)), PolicySettings(**(SIZES | SEEING)))
+    with pytest.raises(ValidationError, match="critic_sees_action needs critic: separate"):
+        PolicySettings(critic_sees_action=True)
