@@ -166,6 +166,11 @@ class GraspVectorEnv(Environment):
     # -- the task --------------------------------------------------------------------------------
 
     @property
+    def settings(self) -> GraspSettings:
+        """The task."""
+        return self._settings
+
+    @property
     def scenes(self) -> Scenes:
         """The running episodes' scenes."""
         return self._running().scenes
