@@ -307,6 +307,18 @@ class Checkpoints:
         write_atomically(self.directory / f"{name}.json", json.dumps(content))
 
 
+def weights_manifest(checkpoint: Loaded, weights: bytes) -> str:
+    """The manifest of a checkpoint of which nothing but the file of weights is kept."""
+    record = _FileRecord(size=len(weights), sha256=hashlib.sha256(weights).hexdigest())
+    return _Manifest(
+        format=FORMAT,
+        step=checkpoint.step,
+        serial=1,
+        score=checkpoint.score,
+        files={WEIGHTS: record},
+    ).model_dump_json(indent=2)
+
+
 def _age_order(entry: CheckpointInfo) -> tuple[float, int]:
     # Unreadable ones count as newest, so that they are reported instead of forgotten.
     return (math.inf if entry.serial is None else entry.serial, entry.step)

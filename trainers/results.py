@@ -84,7 +84,9 @@ def has_checkpoints(directory: Path) -> bool:
 
 
 def find_checkpoint(name: str, results_dir: Path) -> Loaded:
-    """The weights of a checkpoint's folder, of a run's folder (its best), or of a run by its id.
+    """The weights of a run (its best), by its folder or its id, or of a checkpoint's folder.
+
+    An exported policy is such a folder, too.
 
     Raises:
         UserError: there is none.
@@ -98,5 +100,6 @@ def find_checkpoint(name: str, results_dir: Path) -> Loaded:
 
 
 def run_folder(checkpoint: Path) -> Path:
-    """The folder of the run a checkpoint belongs to."""
-    return checkpoint.resolve().parents[1]
+    """The folder of the run a checkpoint belongs to; an exported policy brings its own."""
+    folder = checkpoint.resolve()
+    return folder if (folder / CONFIGURATION).is_file() else folder.parents[1]

@@ -1,0 +1,76 @@
+"""The command line: `python -m trainers.export results/run policies/mine`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from trainers.checkpoint import MANIFEST, WEIGHTS, weights_manifest
+from trainers.errors import UserError
+from trainers.files import write_atomically
+from trainers.learn import DONE, MISTAKE
+from trainers.results import CONFIGURATION, find_checkpoint, run_folder
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exports a policy; returns the exit code."""
+    options = parse(arguments)
+    try:
+        export(options.policy, options.folder, options.results_dir, force=options.force)
+    except UserError as mistake:
+        print(f"error: {mistake}", file=sys.stderr)
+        return MISTAKE
+    print(f"{options.folder}: {', '.join((WEIGHTS, MANIFEST, CONFIGURATION))}")
+    return DONE
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Reads the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m trainers.export",
+        description="Write what it takes to use a policy into a folder of its own.",
+    )
+    parser.add_argument("policy", help="a run (its best checkpoint) or a checkpoint's folder")
+    parser.add_argument("folder", type=Path, help="where to; `trainers.evaluate FOLDER` takes it")
+    parser.add_argument("--force", action="store_true", help="replace a policy that is there")
+    parser.add_argument(
+        "--results-dir", type=Path, default=Path("results"), help="where runs are kept"
+    )
+    return parser.parse_args(arguments)
+
+
+def export(policy: str, folder: Path, results_dir: Path, *, force: bool = False) -> None:
+    """Writes a policy's weights, with their checksum, and its run file; no training state.
+
+    Args:
+        policy: a run's folder or id, or a checkpoint's folder.
+        folder: of the exported policy; made where it is missing.
+        results_dir: where a run is looked for by its id.
+        force: replace a policy that is there.
+
+    Raises:
+        UserError: there is no such policy, one is in the folder already, or it can't be written.
+    """
+    checkpoint = find_checkpoint(policy, results_dir)
+    weights = (checkpoint.path / WEIGHTS).read_bytes()
+    contents: dict[str, bytes | str] = {
+        WEIGHTS: weights,
+        MANIFEST: weights_manifest(checkpoint, weights),
+        CONFIGURATION: (run_folder(checkpoint.path) / CONFIGURATION).read_bytes(),
+    }
+    if not force and (taken := [name for name in contents if (folder / name).exists()]):
+        raise UserError(
+            f"{folder}: {', '.join(taken)} would be replaced: choose another folder, or --force"
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in contents.items():
+            write_atomically(folder / name, content)
+    except OSError as error:
+        raise UserError(f"{folder}: can't be written: {error.strerror}") from error
+
+
+if __name__ == "__main__":
+    sys.exit(main())
