@@ -11,7 +11,7 @@ from trainers.checkpoint import MANIFEST, WEIGHTS, weights_manifest
 from trainers.errors import UserError
 from trainers.files import write_atomically
 from trainers.learn import DONE, MISTAKE
-from trainers.results import CONFIGURATION, find_checkpoint, run_folder
+from trainers.results import CHECKPOINTS, CONFIGURATION, find_checkpoint, run_folder
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -60,6 +60,8 @@ def export(policy: str, folder: Path, results_dir: Path, *, force: bool = False)
         MANIFEST: weights_manifest(checkpoint, weights),
         CONFIGURATION: (run_folder(checkpoint.path) / CONFIGURATION).read_bytes(),
     }
+    if (folder / CHECKPOINTS).is_dir():
+        raise UserError(f"{folder}: this is a run: choose another folder")
     if not force and (taken := [name for name in contents if (folder / name).exists()]):
         raise UserError(
             f"{folder}: {', '.join(taken)} would be replaced: choose another folder, or --force"

@@ -44,6 +44,11 @@ def check(directory: Path, *, resume: bool, force: bool) -> None:
                     f"{directory}: --force deletes runs, and this is none (it has no "
                     f"{CONFIGURATION}); choose another --run-id"
                 )
+            if (directory / MANIFEST).is_file():
+                raise UserError(
+                    f"{directory}: --force deletes runs, and this is an exported policy; choose "
+                    "another --run-id"
+                )
 
 
 def begin(directory: Path, run: RunSettings, *, resume: bool) -> None:

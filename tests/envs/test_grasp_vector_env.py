@@ -109,7 +109,8 @@ def test_spaces_contain_what_is_delivered(make: MakeEnv, frame_grab: bool) -> No
     assert isinstance(env, VectorEnv)
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     spaces = env.single_observation_space.spaces
-    assert spaces["depth"] == DepthImage(24, 32)
+    focal_length_px = 16 / np.tan(np.radians(44.0 / 2))
+    assert spaces["depth"] == DepthImage(24, 32, focal_length_px=focal_length_px)
     assert isinstance(spaces["above"], RgbImage)
     assert env.single_action_space == gymnasium.spaces.Box(-1, 1, (4,), np.float32)
     assert env.action_space.shape == (5, 4)

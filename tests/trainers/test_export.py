@@ -67,6 +67,21 @@ def test_nothing_is_replaced_unasked(
     assert (folder / "configuration.yaml").read_text() != "mine"
 
 
+def test_runs_and_policies_do_not_replace_each_other(
+    results: Path,
+    learn: Callable[..., Any],
+    write_run: Callable[..., Path],
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    assert export(results, results / "toy", "--force") == MISTAKE
+    assert "this is a run" in capfd.readouterr().err
+    assert export(results, results / "mine") == DONE
+    learned = learn(write_run("target"), "--run-id", "mine", "--force")
+    assert learned.code == MISTAKE
+    assert "this is an exported policy" in learned.errors
+    assert (results / "mine" / "weights.safetensors").is_file()
+
+
 def test_damaged_weights_are_named(results: Path, tmp_path: Path) -> None:
     assert export(results, tmp_path / "mine") == DONE
     weights = tmp_path / "mine" / "weights.safetensors"
