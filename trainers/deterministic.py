@@ -29,6 +29,16 @@ class DeterministicSettings(ActorCriticSettings, frozen=True, extra="forbid"):
         "then learn from the critic's loss alone.",
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _has_no_memory(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "memory" in data:
+            raise ValueError(
+                "ddpg has no memory: it learns from single steps; remove `memory`, or use "
+                "trainer_type: ppo or trpo"
+            )
+        return data
+
     @model_validator(mode="after")
     def _critic_can_see(self) -> DeterministicSettings:
         if self.critic == "shared" and self.critic_observations is not None:
