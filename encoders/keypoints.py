@@ -88,7 +88,8 @@ class Keypoints(nn.Module):
         self.values = nn.Linear(hidden, settings.values)
         self.features_dim = count * (COORDINATES + MOMENTS + settings.values)
         self.rays: torch.Tensor
-        self.register_buffer("rays", self._middles(_rays(self.space)), persistent=False)
+        rays = self._middles(self._patches(_rays(self.space)))
+        self.register_buffer("rays", rays.movedim(0, -1).contiguous(), persistent=False)
         min_m, max_m = self.space.range_m
         self._middle_m = math.sqrt(min_m * max_m)
 
@@ -110,9 +111,8 @@ class Keypoints(nn.Module):
 
     def _look(self, depth_m: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Depths (B, H, W) -> patches' shapes (B, n, p * p), middles (B, n, 3), seen (B, n)."""
-        padded = F.pad(depth_m[:, None], (self._padding,) * 4, mode="replicate")[:, 0]
-        patches = padded.unfold(1, self._patch, self._stride).unfold(2, self._patch, self._stride)
-        middle_m = patches[..., self._patch // 2, self._patch // 2]
+        patches = self._patches(depth_m)
+        middle_m = self._middles(patches)
         shapes = (patches - middle_m[..., None, None]).mul_(1.0 / self._clip_m).clamp_(-1.0, 1.0)
         points = middle_m[..., None] * self.rays
         points[..., 2] -= self._middle_m
@@ -136,11 +136,14 @@ class Keypoints(nn.Module):
         bounded = covariance.clamp(-LARGEST_COVARIANCE, LARGEST_COVARIANCE)
         return [(place * KEYPOINT_SCALE).flatten(1), bounded.flatten(1), value.flatten(1)]
 
-    def _middles(self, pixels: torch.Tensor) -> torch.Tensor:
-        """What (H, W, 3) is at the middles of the patches, (h, w, 3)."""
-        padded = F.pad(pixels.permute(2, 0, 1), (self._padding,) * 4, mode="replicate")
-        patches = padded.unfold(1, self._patch, self._stride).unfold(2, self._patch, self._stride)
-        return patches[..., self._patch // 2, self._patch // 2].permute(1, 2, 0).contiguous()
+    def _patches(self, images: torch.Tensor) -> torch.Tensor:
+        """Images (B, H, W) -> their patches (B, h, w, p, p)."""
+        padded = F.pad(images[:, None], (self._padding,) * 4, mode="replicate")[:, 0]
+        return padded.unfold(1, self._patch, self._stride).unfold(2, self._patch, self._stride)
+
+    def _middles(self, patches: torch.Tensor) -> torch.Tensor:
+        """The pixels (B, h, w) in the middles of patches (B, h, w, p, p)."""
+        return patches[..., self._patch // 2, self._patch // 2]
 
 
 def _known_camera(space: Box) -> DepthImage:
@@ -154,10 +157,10 @@ def _known_camera(space: Box) -> DepthImage:
 
 
 def _rays(space: DepthImage) -> torch.Tensor:
-    """(H, W, 3) the points at depth 1 that pixels' centres see: x right, y down, z forward."""
+    """(3, H, W) the points at depth 1 that pixels' centres see: x right, y down, z forward."""
     assert space.focal_length_px is not None
     height, width, _ = space.shape
     rows = (torch.arange(height) + 0.5 - height / 2) / space.focal_length_px
     columns = (torch.arange(width) + 0.5 - width / 2) / space.focal_length_px
     y, x = torch.meshgrid(rows, columns, indexing="ij")
-    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+    return torch.stack([x, y, torch.ones_like(x)])

@@ -273,7 +273,7 @@ def test_choices_are_refused_before_anything_starts(
 
 
 def test_memory_is_refused_with_the_algorithms_that_have_it() -> None:
-    with pytest.raises(ValidationError, match="ddpg has no memory.* ppo or trpo"):
+    with pytest.raises(ValidationError, match=r"ddpg has no memory.* ppo or trpo"):
         DDPGSettings.model_validate({"network_settings": {"memory": {"memory_size": 8}}})
 
 
