@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import gymnasium
 import numpy as np
 import torch
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
@@ -20,6 +20,14 @@ from trainers.policy import ACTOR_GAIN, CRITIC_GAIN, ActorCriticSettings, observ
 ENCODERS_ALONE = {"num_layers": 0}
 
 
+def _refuse_memory(value: Any) -> None:
+    if value is not None:
+        raise ValueError(
+            "ddpg has no memory, it learns from single steps: remove the key, or use "
+            "trainer_type: ppo or trpo"
+        )
+
+
 class DeterministicSettings(ActorCriticSettings, frozen=True, extra="forbid"):
     """Networks of a deterministic actor and of its critic."""
 
@@ -28,16 +36,9 @@ class DeterministicSettings(ActorCriticSettings, frozen=True, extra="forbid"):
         description="A critic with encoders of its own, or encoders shared with the actor, which "
         "then learn from the critic's loss alone.",
     )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _has_no_memory(cls, data: Any) -> Any:
-        if isinstance(data, dict) and "memory" in data:
-            raise ValueError(
-                "ddpg has no memory: it learns from single steps; remove `memory`, or use "
-                "trainer_type: ppo or trpo"
-            )
-        return data
+    memory: Annotated[Any, AfterValidator(_refuse_memory)] = Field(
+        None, description="Always null: ddpg has no memory."
+    )
 
     @model_validator(mode="after")
     def _critic_can_see(self) -> DeterministicSettings:

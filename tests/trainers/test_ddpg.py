@@ -272,11 +272,6 @@ def test_choices_are_refused_before_anything_starts(
         Session(make_run("choice", {"trainer_type": "ddpg"}), registries)
 
 
-def test_memory_is_refused_with_the_algorithms_that_have_it() -> None:
-    with pytest.raises(ValidationError, match=r"ddpg has no memory.* ppo or trpo"):
-        DDPGSettings.model_validate({"network_settings": {"memory": {"memory_size": 8}}})
-
-
 def test_actions_without_bounds_are_refused(make_factory: Callable[..., NetworkFactory]) -> None:
     factory = make_factory(LINE.spaces, action_space=Box(-np.inf, 1.0, (2,), np.float32))
     with pytest.raises(UserError, match="within bounds"):

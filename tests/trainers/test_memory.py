@@ -182,7 +182,9 @@ def test_wrong_settings_name_their_key_and_what_is_allowed(
 
 
 def test_ddpg_has_no_memory(make_run: Callable[..., RunSettings]) -> None:
-    with pytest.raises(SettingsError, match=r"trainer\.network_settings\.memory: unknown key"):
+    with pytest.raises(
+        SettingsError, match=r"network_settings\.memory: ddpg has no memory.* ppo or trpo"
+    ):
         make_run("target", remembering({}, "ddpg"))
 
 
