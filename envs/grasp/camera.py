@@ -57,18 +57,22 @@ def focal_length_px(camera: Camera) -> float:
     return camera.width / 2.0 / float(np.tan(np.radians(camera.fov_deg) / 2.0))
 
 
-def look_at(position_m: Floats, target_m: Floats) -> Floats:
-    """Rotation (3, 3) of an upright camera at `position_m` that looks at `target_m`."""
+def look_at(position_m: Floats, target_m: Floats, roll_rad: float = 0.0) -> Floats:
+    """Rotation (3, 3) of a camera at `position_m` that looks at `target_m`.
+
+    Upright without `roll_rad`, which turns it about its optical axis, clockwise seen from behind.
+    """
     forward = np.asarray(target_m, float) - position_m
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     if np.linalg.norm(right) < 1e-9:  # looking straight down or up: the image's right is -y
         right = np.array([0.0, -1.0, 0.0])
     right = right / np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward], axis=1)
+    upright = np.stack([right, np.cross(forward, right), forward], axis=1)
+    return upright @ euler_rotations(np.array([[0.0, 0.0, roll_rad]]))[0]
 
 
-def small_rotation(angles_rad: Floats) -> Floats:
+def euler_rotations(angles_rad: Floats) -> Floats:
     """Rotations (n, 3, 3) by angles (n, 3) about x, then y, then z."""
     sine, cosine = np.sin(angles_rad), np.cos(angles_rad)
     zero, one = np.zeros(len(angles_rad)), np.ones(len(angles_rad))
@@ -88,11 +92,12 @@ def sample_views(
 ) -> Views:
     """Places n cameras, moved by up to +-`position_m` and turned by `rotation_deg` per axis."""
     nominal = np.array(camera.position_m)
+    nominal_rotation = look_at(nominal, np.array(camera.target_m), np.radians(camera.roll_deg))
     jitter = np.radians(rng.uniform(-rotation_deg, rotation_deg, (n, 3)))
     return Views(
         camera,
         nominal + rng.uniform(-position_m, position_m, (n, 3)),
-        look_at(nominal, np.array(camera.target_m)) @ small_rotation(jitter),
+        nominal_rotation @ euler_rotations(jitter),
         rng.uniform(*camera.near_m, n),
         rng.uniform(*camera.far_m, n),
         np.full(n, camera.noise_sigma_m),

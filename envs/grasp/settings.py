@@ -31,6 +31,12 @@ class Camera(BaseModel, frozen=True, extra="forbid"):
     )
     position_m: Point = Field((0.36, 0.25, 0.95), description="Optical centre, world frame.")
     target_m: Point = Field((1.10, 0.0, 0.75), description="The point it looks at, world frame.")
+    roll_deg: float = Field(
+        0.0,
+        ge=-180.0,
+        le=180.0,
+        description="How far it is turned about its optical axis, clockwise seen from behind it.",
+    )
     near_m: Range = Field((0.05, 0.10), description="Near clip plane, drawn at every reset.")
     far_m: Range = Field((2.5, 3.0), description="Far clip plane, drawn at every reset.")
     range_m: Range = Field((0.4, 2.0), description="Depth only: the sensor's measuring range.")

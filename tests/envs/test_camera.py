@@ -6,12 +6,12 @@ import pytest
 from encoders.spaces import DepthImage
 from envs.grasp.camera import (
     Views,
+    euler_rotations,
     focal_length_px,
     look_at,
     project,
     sample_views,
     sense_depth,
-    small_rotation,
 )
 from envs.grasp.settings import Camera
 
@@ -66,6 +66,26 @@ def test_look_at_hand_computed(
     assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
+def test_rolled_camera_sees_the_world_turned_the_other_way() -> None:
+    axes = look_at(np.zeros(3), np.array([5.0, 0, 0]), np.pi / 2)
+    # Turned clockwise by a quarter, what was to its right (-y) is now up in its image.
+    expected = np.stack([(0, 0, -1), (0, 1, 0), (1, 0, 0)], axis=1)
+    np.testing.assert_allclose(axes, expected, atol=1e-12)
+
+
+def test_roll_leaves_the_middle_of_the_image_where_it_is() -> None:
+    upright = Camera(type="depth", width=80, height=80)
+    rolled = upright.model_copy(update={"roll_deg": 45.0})
+    points = np.array([upright.target_m, (1.0, 0.2, 0.7)])[None]
+    before = project(fixed(upright), points)[0]
+    after = project(fixed(rolled), points)[0]
+    assert after[0] == pytest.approx(before[0])
+    # A turn of the camera by +45 degrees turns the image by -45 about its middle.
+    cosine = np.sqrt(0.5)
+    turned = np.array([[cosine, cosine], [-cosine, cosine]]) @ (before[1, :2] - 40.0) + 40.0
+    np.testing.assert_allclose(after[1], [*turned, before[1, 2]], atol=1e-9)
+
+
 def test_the_point_looked_at_is_in_the_middle_of_the_image() -> None:
     camera = Camera(type="depth", width=90, height=70)
     u, v, depth = project(fixed(camera), np.array(camera.target_m)[None, None])[0, 0]
@@ -74,9 +94,9 @@ def test_the_point_looked_at_is_in_the_middle_of_the_image() -> None:
     assert depth == pytest.approx(np.sqrt((distance**2).sum()))
 
 
-def test_small_rotation_turns_about_x_then_y_then_z() -> None:
+def test_euler_rotations_turn_about_x_then_y_then_z() -> None:
     quarter = np.pi / 2
-    turns = small_rotation(
+    turns = euler_rotations(
         np.array([(quarter, 0, 0), (0, quarter, 0), (0, 0, quarter), (quarter, quarter, 0)])
     )
     x, y, z = np.eye(3)
