@@ -149,6 +149,8 @@ class DDPG:
         self._targets = self._bootstrapped_returns if hyper.gamma else self._buffer.rewards
         self._due = 0.0  # updates that were asked for by transitions, and not made yet
         self._moments: list[_Moment] = []
+        self._features: Tensor | None = None  # what the actor makes of the frames in view, (N, f)
+        self._new = np.arange(0)  # where the frame came into view with the last step
 
     def initial_state(self, count: int) -> Tensor:
         """See `Algorithm.initial_state`; nothing is remembered."""
@@ -167,7 +169,7 @@ class DDPG:
     @torch.no_grad()
     def collect(self) -> None:
         """See `Algorithm.collect`."""
-        self._moments = []
+        self._moments, self._features = [], None
         for _ in range(self._settings.time_horizon):
             self._moments.append(self._play())
 
@@ -218,6 +220,7 @@ class DDPG:
         with timed("act"):
             actions = self._explore(before)
         step = interaction.step(to_environment(self.policy.to_space(actions), space))
+        self._new = np.flatnonzero(~step.same_frame)
         ended = torch.from_numpy(step.done)
         self._noise.restart(ended.to(self._device))
         return _Moment(before, actions.cpu().numpy(), step, interaction.observations)
@@ -229,10 +232,23 @@ class DDPG:
         if step < hyper.buffer_init_steps:
             return uniform
         space = self._interaction.env.single_observation_space
-        actions = self.policy.online.act(to_tensors(raw, space, self._device))
+        observations = to_tensors(raw, space, self._device)
+        actions = self.policy.online.act(observations, self._look(raw))
         sigma = self._sigma(step / self._settings.max_steps)
         noisy = (actions + sigma * self._noise.sample(self._generator)).clamp(-1.0, 1.0)
         return torch.where(self._rand((len(noisy), 1)) < hyper.random_actions, uniform, noisy)
+
+    def _look(self, raw: Mapping[str, NDArray[Any]]) -> Tensor | None:
+        """What the actor makes of the frames in view, (N, f): each is encoded once."""
+        known, space = self._features, self._interaction.env.single_observation_space
+        new = self._new if known is not None else np.arange(self._shape[0])
+        if len(new):
+            frames = to_tensors(raw, space, self._device, new).frames
+            fresh = self.policy.online.encode_frames(frames)
+            if known is not None and fresh is not None:
+                fresh = known.index_copy(0, torch.from_numpy(new).to(self._device), fresh)
+            self._features = fresh
+        return self._features
 
     def _rand(self, shape: tuple[int, int]) -> Tensor:
         return torch.rand(shape, generator=self._generator, device=self._device)

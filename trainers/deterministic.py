@@ -76,14 +76,19 @@ class DeterministicActorCritic(nn.Module):
         critic_inputs = self.critic_encoder.features_dim + size
         self.critic = nn.Sequential(*_layers(critic_inputs, 1, CRITIC_GAIN, settings))
 
-    def act(self, observations: Observations) -> Tensor:
-        """mu(s): actions (B, A) in [-1, 1]."""
+    def act(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
+        """mu(s): actions (B, A) in [-1, 1]; `encode_frames` may have looked at the frames."""
         if self.actor_encoder is None:
-            features = self.critic_encoder(observations).detach()
+            features = self.critic_encoder(observations, frame_features).detach()
         else:
-            features = self.actor_encoder(observations)
+            features = self.actor_encoder(observations, frame_features)
         actions: Tensor = self.actor(features)
         return actions
+
+    def encode_frames(self, frames: dict[str, Tensor]) -> Tensor | None:
+        """What the actor makes of frames alone, (U, f); None without cameras."""
+        encoder = self.critic_encoder if self.actor_encoder is None else self.actor_encoder
+        return encoder.encode_frames(frames)
 
     def value(self, observations: Observations, actions: Tensor) -> Tensor:
         """Q(s, a), (B,)."""

@@ -20,7 +20,7 @@ from trainers.deterministic import DeterministicPolicy, DeterministicSettings
 from trainers.errors import UserError
 from trainers.interaction import Interaction, NonFiniteError, concatenate
 from trainers.networks import NetworkFactory
-from trainers.observations import Observations
+from trainers.observations import Observations, to_tensors
 from trainers.plugins import Registries
 from trainers.session import Session
 from trainers.settings import RunSettings
@@ -429,6 +429,30 @@ def test_a_loss_that_is_not_finite_stops_the_run_before_the_weights_change(
     with pytest.raises(NonFiniteError, match=r"step 16: the loss is (inf|nan), its gradient's"):
         algorithm.update(0.0)
     assert not changed(before, algorithm.policy.state_dict().values())
+
+
+def test_a_frame_is_encoded_once_as_long_as_it_is_in_view(
+    make_ddpg: MakeDDPG, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hyper = {"buffer_init_steps": 0, "noise": {"type": "gaussian", "sigma": 0.0}}
+    algorithm = make_ddpg("picture", hyper, time_horizon=9, encoders=CAMERA)
+    online, encoded = algorithm.policy.online, []
+    encode = online.encode_frames
+
+    def counting(frames: dict[str, Tensor]) -> Tensor | None:
+        encoded.append(len(frames["camera"]))
+        return encode(frames)
+
+    monkeypatch.setattr(online, "encode_frames", counting)
+    algorithm.collect()
+    moments = algorithm._moments
+    ended = [int(moment.step.done.sum()) for moment in moments[:-1]]
+    assert sum(ended) > 0
+    assert encoded == [len(moments[0].actions), *filter(None, ended)]
+    space = algorithm._interaction.env.single_observation_space
+    for moment in moments:
+        seen = to_tensors(moment.observations, space, torch.device("cpu"))
+        torch.testing.assert_close(torch.from_numpy(moment.actions), online.act(seen))
 
 
 def test_a_collection_leaves_the_state_before_it_as_it_was(make_ddpg: MakeDDPG) -> None:
