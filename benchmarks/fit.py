@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import BaseModel
 from rich.console import Console
 from torch import Tensor
 from torch.nn import functional as F
@@ -27,7 +28,11 @@ from torch.nn import functional as F
 from envs.grasp.scene import heading
 from envs.grasp.task import goal_middle_m
 from envs.grasp.vector_env import GraspVectorEnv
+from trainers.ddpg import DDPGSettings
+from trainers.deterministic import DeterministicActorCritic
+from trainers.errors import UserError
 from trainers.evaluation import FIRST_SEED, final_parameters
+from trainers.networks import NetworkFactory
 from trainers.observations import to_tensors
 from trainers.plugins import load_registries
 from trainers.policy import ActorCritic, to_environment
@@ -35,6 +40,8 @@ from trainers.ppo import PPOSettings
 from trainers.session import build_environment, build_factory
 from trainers.settings import RunSettings, load_run
 from trainers.trpo import TRPOSettings
+
+Policy = ActorCritic | DeterministicActorCritic
 
 JUDGED = 2000
 REPORTS = 6
@@ -52,9 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         closing(_environment(run, options.seed)) as training,
         closing(_environment(run, FIRST_SEED)) as unseen,
     ):
-        settings = run.trainer.settings
-        assert isinstance(settings, PPOSettings | TRPOSettings)
-        policy = ActorCritic(build_factory(run, registries, training), settings.network_settings)
+        policy = build_policy(run.trainer.settings, build_factory(run, registries, training))
         for share, images in fit(policy, training, options.minutes * 60, options.learning_rate):
             figures = ", ".join(f"{name} {value}" for name, value in judge(policy, unseen).items())
             Console().print(f"{share * options.minutes:.1f} min, {images:,} images: {figures}")
@@ -72,15 +77,26 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_intermixed_args(arguments)
 
 
+def build_policy(settings: BaseModel, factory: NetworkFactory) -> Policy:
+    """The networks that a run's algorithm would train."""
+    match settings:
+        case DDPGSettings():
+            return DeterministicActorCritic(factory, settings.network_settings)
+        case PPOSettings() | TRPOSettings():
+            return ActorCritic(factory, settings.network_settings)
+    raise UserError(f"trainer: no fit is known for the policy of {type(settings).__name__}")
+
+
 def fit(
-    policy: ActorCritic, env: GraspVectorEnv, seconds: float, learning_rate: float
+    policy: Policy, env: GraspVectorEnv, seconds: float, learning_rate: float
 ) -> Iterator[tuple[float, int]]:
     """Fits for a time, at a rate that falls along a cosine; now and then tells how far it is.
 
     Yields:
         The share of the time that is over, and the images seen.
     """
-    optimizer = torch.optim.Adam(policy.actor_parameters(), fused=True)
+    parameters = list(policy.actor_parameters())
+    optimizer = torch.optim.Adam(parameters, fused=True)
     tolerances = _tolerances(env)
     begin, pauses, steps, reports = time.perf_counter(), 0.0, 0, 0
     while True:
@@ -98,13 +114,13 @@ def fit(
         error = (_actions(policy, env) - torch.from_numpy(right_actions(env))) / tolerances
         optimizer.zero_grad()
         F.smooth_l1_loss(error, torch.zeros_like(error)).backward()
-        torch.nn.utils.clip_grad_norm_(policy.actor_parameters(), MAX_GRADIENT_NORM)
+        torch.nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
         optimizer.step()
         steps += 1
 
 
 @torch.no_grad()
-def judge(policy: ActorCritic, env: GraspVectorEnv) -> dict[str, str]:
+def judge(policy: Policy, env: GraspVectorEnv) -> dict[str, str]:
     """Success on unseen scenes, and median / 95th percentile of the errors."""
     env.reset(seed=FIRST_SEED)
     parts: list[dict[str, NDArray[Any]]] = []
@@ -131,11 +147,13 @@ def right_actions(env: GraspVectorEnv) -> NDArray[np.float32]:
     return env.action_for(goal_m, scenes.target_yaw_rad).astype(np.float32)
 
 
-def _actions(policy: ActorCritic, env: GraspVectorEnv) -> Tensor:
+def _actions(policy: Policy, env: GraspVectorEnv) -> Tensor:
     """The policy's actions (N, 4) before new scenes."""
     observations, _ = env.reset()
-    space = env.single_observation_space
-    return policy.distribution(to_tensors(observations, space, torch.device("cpu"))).mode()
+    seen = to_tensors(observations, env.single_observation_space, torch.device("cpu"))
+    if isinstance(policy, DeterministicActorCritic):
+        return policy.act(seen)
+    return policy.distribution(seen).mode()
 
 
 def _tolerances(env: GraspVectorEnv) -> Tensor:
