@@ -21,8 +21,8 @@ from trainers.interaction import Interaction, Step
 from trainers.metrics import Averager
 from trainers.networks import NetworkFactory
 from trainers.noise import GaussianSettings, Noise, NoiseSettings
-from trainers.observations import Observations, to_tensors
-from trainers.policy import to_environment
+from trainers.observations import Observations, take, to_tensors
+from trainers.policy import to_environment, with_rows
 from trainers.replay import ReplayBuffer
 from trainers.schedules import CONSTANT, Schedule
 from trainers.timers import timed
@@ -233,21 +233,20 @@ class DDPG:
             return uniform
         space = self._interaction.env.single_observation_space
         observations = to_tensors(raw, space, self._device)
-        actions = self.policy.online.act(observations, self._look(raw))
+        actions = self.policy.online.act(observations, self._look(observations.frames))
         sigma = self._sigma(step / self._settings.max_steps)
         noisy = (actions + sigma * self._noise.sample(self._generator)).clamp(-1.0, 1.0)
         return torch.where(self._rand((len(noisy), 1)) < hyper.random_actions, uniform, noisy)
 
-    def _look(self, raw: Mapping[str, NDArray[Any]]) -> Tensor | None:
+    def _look(self, frames: dict[str, Tensor]) -> Tensor | None:
         """What the actor makes of the frames in view, (N, f): each is encoded once."""
-        known, space = self._features, self._interaction.env.single_observation_space
-        new = self._new if known is not None else np.arange(self._shape[0])
-        if len(new):
-            frames = to_tensors(raw, space, self._device, new).frames
-            fresh = self.policy.online.encode_frames(frames)
-            if known is not None and fresh is not None:
-                fresh = known.index_copy(0, torch.from_numpy(new).to(self._device), fresh)
-            self._features = fresh
+        online = self.policy.online
+        if self._features is None:
+            self._features = online.encode_frames(frames)
+        elif len(self._new):
+            rows = torch.from_numpy(self._new).to(self._device)
+            fresh = online.encode_frames({name: take(f, rows) for name, f in frames.items()})
+            self._features = with_rows(self._features, rows, fresh)
         return self._features
 
     def _rand(self, shape: tuple[int, int]) -> Tensor:

@@ -71,24 +71,27 @@ class DeterministicActorCritic(nn.Module):
         if settings.critic == "separate":
             self.actor_encoder = factory.network(encoders_alone, self.actor_sees)
         size = bounded(factory.action_space).shape[0]
-        actor_inputs = (self.actor_encoder or self.critic_encoder).features_dim
+        actor_inputs = self._acting_encoder.features_dim
         self.actor = nn.Sequential(*_layers(actor_inputs, size, ACTOR_GAIN, settings), nn.Tanh())
         critic_inputs = self.critic_encoder.features_dim + size
         self.critic = nn.Sequential(*_layers(critic_inputs, 1, CRITIC_GAIN, settings))
 
     def act(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
         """mu(s): actions (B, A) in [-1, 1]; `encode_frames` may have looked at the frames."""
+        features = self._acting_encoder(observations, frame_features)
         if self.actor_encoder is None:
-            features = self.critic_encoder(observations, frame_features).detach()
-        else:
-            features = self.actor_encoder(observations, frame_features)
+            features = features.detach()
         actions: Tensor = self.actor(features)
         return actions
 
     def encode_frames(self, frames: dict[str, Tensor]) -> Tensor | None:
         """What the actor makes of frames alone, (U, f); None without cameras."""
-        encoder = self.critic_encoder if self.actor_encoder is None else self.actor_encoder
-        return encoder.encode_frames(frames)
+        return self._acting_encoder.encode_frames(frames)
+
+    @property
+    def _acting_encoder(self) -> Network:
+        """What the actor acts on: its own encoders, or those it shares with the critic."""
+        return self.critic_encoder if self.actor_encoder is None else self.actor_encoder
 
     def value(self, observations: Observations, actions: Tensor) -> Tensor:
         """Q(s, a), (B,)."""

@@ -245,11 +245,12 @@ class FrameFeatures:
     def with_rows(self, rows: Tensor, other: FrameFeatures) -> FrameFeatures:
         """These, with other features at some rows."""
         return FrameFeatures(
-            _with_rows(self.actor, rows, other.actor), _with_rows(self.critic, rows, other.critic)
+            with_rows(self.actor, rows, other.actor), with_rows(self.critic, rows, other.critic)
         )
 
 
-def _with_rows(features: Tensor | None, rows: Tensor, other: Tensor | None) -> Tensor | None:
+def with_rows(features: Tensor | None, rows: Tensor, other: Tensor | None) -> Tensor | None:
+    """Features (B, f) with others in place of some rows; None where there are none."""
     if features is None or other is None:
         return None
     return features.index_copy(0, rows, other)
