@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -32,6 +33,7 @@ from trainers.ddpg import DDPGSettings
 from trainers.deterministic import DeterministicActorCritic
 from trainers.errors import UserError
 from trainers.evaluation import FIRST_SEED, final_parameters
+from trainers.learn import DONE, MISTAKE
 from trainers.networks import NetworkFactory
 from trainers.observations import to_tensors
 from trainers.plugins import load_registries
@@ -50,20 +52,14 @@ MAX_GRADIENT_NORM = 5.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fits, and prints how far it has come."""
+    """Fits, and prints how far it has come; returns the exit code."""
     options = parse(arguments)
-    registries = load_registries()
-    run = load_run(options.config, [*options.overrides, "environment.num_envs=256"], registries)
-    torch.manual_seed(options.seed)
-    with (
-        closing(_environment(run, options.seed)) as training,
-        closing(_environment(run, FIRST_SEED)) as unseen,
-    ):
-        policy = build_policy(run.trainer.settings, build_factory(run, registries, training))
-        for share, images in fit(policy, training, options.minutes * 60, options.learning_rate):
-            figures = ", ".join(f"{name} {value}" for name, value in judge(policy, unseen).items())
-            Console().print(f"{share * options.minutes:.1f} min, {images:,} images: {figures}")
-    return 0
+    try:
+        _fit_and_print(options)
+    except UserError as mistake:
+        print(f"error: {mistake}", file=sys.stderr)
+        return MISTAKE
+    return DONE
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -78,13 +74,17 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def build_policy(settings: BaseModel, factory: NetworkFactory) -> Policy:
-    """The networks that a run's algorithm would train."""
+    """The networks that a run's algorithm would train.
+
+    Raises:
+        UserError: it is an algorithm of someone else's.
+    """
     match settings:
         case DDPGSettings():
             return DeterministicActorCritic(factory, settings.network_settings)
         case PPOSettings() | TRPOSettings():
             return ActorCritic(factory, settings.network_settings)
-    raise UserError(f"trainer: no fit is known for the policy of {type(settings).__name__}")
+    raise UserError("trainer.trainer_type: only policies of ppo, trpo and ddpg can be fitted")
 
 
 def fit(
@@ -166,9 +166,28 @@ def _tolerances(env: GraspVectorEnv) -> Tensor:
     )
 
 
+def _fit_and_print(options: argparse.Namespace) -> None:
+    registries = load_registries()
+    run = load_run(options.config, [*options.overrides, "environment.num_envs=256"], registries)
+    torch.manual_seed(options.seed)
+    with (
+        closing(_environment(run, options.seed)) as training,
+        closing(_environment(run, FIRST_SEED)) as unseen,
+    ):
+        policy = build_policy(run.trainer.settings, build_factory(run, registries, training))
+        for share, images in fit(policy, training, options.minutes * 60, options.learning_rate):
+            figures = ", ".join(f"{name} {value}" for name, value in judge(policy, unseen).items())
+            Console().print(f"{share * options.minutes:.1f} min, {images:,} images: {figures}")
+
+
 def _environment(run: RunSettings, seed: int) -> GraspVectorEnv:
     env = build_environment(run, seed)
-    assert isinstance(env, GraspVectorEnv)
+    if not isinstance(env, GraspVectorEnv):
+        env.close()
+        raise UserError(
+            "environment.type: only the grasp task knows the right actions; fit a run file with "
+            "`environment: {type: grasp}`"
+        )
     env.set_parameters(final_parameters(run))
     return env
 

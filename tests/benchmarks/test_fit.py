@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from benchmarks import fit
 from envs.grasp.settings import GraspSettings
 from envs.grasp.vector_env import GraspVectorEnv
+from trainers.plugins import load_registries
+from trainers.session import build_factory
+from trainers.settings import load_run
 
 RUN_FILE = Path(__file__).parents[2] / "config" / "run.yaml"
 
@@ -40,3 +45,21 @@ def test_it_tells_how_far_it_is(capsys) -> None:
     assert len(lines) >= 2
     assert "0 images: success 0.0%" in lines[0]
     assert all("position mm" in line and "yaw deg" in line for line in lines)
+
+
+def test_what_can_not_be_fitted_is_said(capsys) -> None:
+    assert fit.main([str(RUN_FILE.parent / "gymnasium" / "pendulum_ppo.yaml")]) == 2
+    assert "environment.type: only the grasp task" in capsys.readouterr().err
+    assert fit.main(["nowhere.yaml"]) == 2
+    assert "nowhere.yaml: there is no such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["quick.yaml", "run.yaml"])
+def test_actions_of_stochastic_and_deterministic_policies_can_be_fitted(name: str) -> None:
+    run = load_run(RUN_FILE.parent / name, ["environment.num_envs=8"], load_registries())
+    with closing(fit._environment(run, 0)) as env:
+        factory = build_factory(run, load_registries(), env)
+        policy = fit.build_policy(run.trainer.settings, factory)
+        actions = fit._actions(policy, env)
+    assert actions.shape == (8, 4)
+    assert actions.requires_grad
