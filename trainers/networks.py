@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import gymnasium
@@ -187,7 +186,6 @@ class NetworkFactory:
         settings: NetworkSettings,
         names: Sequence[str],
         memory: MemorySettings | None = None,
-        also: Mapping[str, gymnasium.Space[Any]] = MappingProxyType({}),
     ) -> Network:
         """A new network on some of the observations.
 
@@ -195,12 +193,11 @@ class NetworkFactory:
             settings: what follows the encoders.
             names: of the observations.
             memory: what follows the trunk, if anything.
-            also: spaces of vectors that are no observations of the environment, by name.
 
         Raises:
             UserError: an encoder does not fit its observation.
         """
-        spaces = {name: self.observation_space[name] for name in names} | dict(also)
+        spaces = {name: self.observation_space[name] for name in names}
         encoders = {name: self._encoder(name, space, settings) for name, space in spaces.items()}
         return Network(encoders, spaces, settings, memory)
 

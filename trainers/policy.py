@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import gymnasium
 import numpy as np
@@ -22,7 +22,6 @@ from trainers.observations import Observations
 ACTOR_GAIN = 0.01  # a small last layer: at first every observation gets nearly the same action
 CRITIC_GAIN = 1.0
 TINY_STD = 1e-6
-SHOWN_ACTION = "policy_action"  # beside the observations of a critic
 NETWORK_PATH = "trainer.network_settings"
 
 
@@ -43,11 +42,6 @@ class PolicySettings(ActorCriticSettings, frozen=True, extra="forbid"):
     critic: Literal["shared", "separate"] = Field(
         "shared", description="A critic on the actor's hidden vector, or one with its own network."
     )
-    critic_sees_action: bool = Field(
-        False,
-        description="A separate critic also sees the policy's likeliest action, and so can tell "
-        "how good that is where it knows more than the policy.",
-    )
     initial_std: float = Field(
         1.0, gt=0.0, description="Continuous actions: standard deviation to begin with."
     )
@@ -62,8 +56,6 @@ class PolicySettings(ActorCriticSettings, frozen=True, extra="forbid"):
     def _critic_can_see(self) -> PolicySettings:
         if self.critic == "shared" and self.critic_observations is not None:
             raise ValueError("critic_observations needs critic: separate")
-        if self.critic == "shared" and self.critic_sees_action:
-            raise ValueError("critic_sees_action needs critic: separate")
         if self.min_std > self.initial_std:
             raise ValueError(
                 f"min_std {self.min_std:g} is over initial_std {self.initial_std:g}: lower it"
@@ -90,11 +82,8 @@ class ActorCritic(nn.Module):
         super().__init__()
         actor, critic = observed(factory, settings)
         self.actor = factory.network(settings, actor, settings.memory)
-        self._critic_sees_action = settings.critic_sees_action
         self.critic = (
-            factory.network(
-                settings, critic, settings.memory, also=_shown_action(factory, settings)
-            )
+            factory.network(settings, critic, settings.memory)
             if settings.critic == "separate"
             else None
         )
@@ -142,9 +131,7 @@ class ActorCritic(nn.Module):
         hidden, state = self.actor.recall(seen_by_actor, known.actor)
         distribution, critic_hidden = self._distribution(hidden), hidden
         if self.critic is not None:
-            critic_hidden, critic_state = self.critic.recall(
-                self._with_action(seen_by_critic, distribution), known.critic
-            )
+            critic_hidden, critic_state = self.critic.recall(seen_by_critic, known.critic)
             state = torch.cat([state, critic_state], dim=1)
         return distribution, self._value(critic_hidden), state
 
@@ -158,9 +145,6 @@ class ActorCritic(nn.Module):
         seen_by_actor, seen_by_critic = self._split(observations)
         if self.critic is None:
             return self._value(self.actor(seen_by_actor, known.actor))
-        if self._critic_sees_action:
-            distribution = self._distribution(self.actor(seen_by_actor, known.actor))
-            seen_by_critic = self._with_action(seen_by_critic, distribution)
         return self._value(self.critic(seen_by_critic, known.critic))
 
     def encode_frames(self, observations: Observations) -> FrameFeatures:
@@ -194,13 +178,6 @@ class ActorCritic(nn.Module):
         floor = torch.tensor(self._min_log_std, device=outputs.device)
         return DiagonalGaussian(outputs, torch.logaddexp(self.log_std, floor))
 
-    def _with_action(self, observations: Observations, distribution: Distribution) -> Observations:
-        """What a critic sees, with the policy's likeliest action where it sees that."""
-        if not self._critic_sees_action:
-            return observations
-        action = distribution.mode().detach()
-        return replace(observations, vectors=observations.vectors | {SHOWN_ACTION: action})
-
     def _value(self, hidden: Tensor) -> Tensor:
         value: Tensor = self.value_head(hidden).squeeze(-1)
         return value
@@ -215,20 +192,6 @@ class ActorCritic(nn.Module):
             replace(observations, sequences=replace(sequences, state=actor)),
             replace(observations, sequences=replace(sequences, state=critic)),
         )
-
-
-def _shown_action(
-    factory: NetworkFactory, settings: PolicySettings
-) -> dict[str, gymnasium.Space[Any]]:
-    """The space of the action that a critic sees, by its name; empty where it sees none."""
-    if not settings.critic_sees_action:
-        return {}
-    if not isinstance(factory.action_space, gymnasium.spaces.Box):
-        raise UserError(
-            f"{NETWORK_PATH}.critic_sees_action: actions of the space {factory.action_space} are "
-            "no vectors; remove it, or use an environment with continuous actions"
-        )
-    return {SHOWN_ACTION: factory.action_space}
 
 
 class FrameFeatures:
