@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -29,8 +30,9 @@ def descend(
     Raises:
         NonFiniteError: the loss or its gradient is not finite; the parameters are as before.
     """
-    optimizer.zero_grad(set_to_none=True)
-    loss.backward(inputs=parameters)
+    gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        parameter.grad = gradient
     norm = nn.utils.clip_grad_norm_(parameters, max_gradient_norm)
     check_finite(loss, norm, step)
     optimizer.step()
@@ -38,7 +40,7 @@ def descend(
 
 def check_finite(loss: Tensor, gradient_norm: Tensor, step: int) -> None:
     """Raises NonFiniteError, naming the run's step, where a loss or its gradient is not finite."""
-    if not torch.isfinite(loss + gradient_norm):
+    if not math.isfinite((loss + gradient_norm).item()):
         raise NonFiniteError(
             f"step {step}: the loss is {loss.item()}, its gradient's norm {gradient_norm.item()}"
         )

@@ -8,6 +8,7 @@ happen here; whoever uses a distribution sees one number per action.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, Self
 
@@ -51,6 +52,11 @@ class Distribution(Protocol):
 
     def __getitem__(self, rows: slice | Tensor) -> Self:
         """Return the distribution of some rows: a slice, a mask (B,) or indices (M,)."""
+        ...
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """Return the distribution of all rows of several, which one policy made."""
         ...
 
 
@@ -141,6 +147,14 @@ class DiagonalGaussian:
         shared = self.log_std.ndim < self.mean.ndim
         return DiagonalGaussian(self.mean[rows], self.log_std if shared else self.log_std[rows])
 
+    @classmethod
+    def concatenate(cls, parts: Sequence[DiagonalGaussian]) -> DiagonalGaussian:
+        """Return the distribution of all rows of several, which one policy made."""
+        log_std = parts[0].log_std
+        if log_std.ndim == parts[0].mean.ndim:
+            log_std = torch.cat([part.log_std for part in parts])
+        return cls(torch.cat([part.mean for part in parts]), log_std)
+
 
 @dataclass(frozen=True, eq=False)
 class Categorical:
@@ -196,3 +210,8 @@ class Categorical:
     def __getitem__(self, rows: slice | Tensor) -> Categorical:
         """Return the distribution of some rows: a slice, a mask (B,) or indices (M,)."""
         return Categorical(self.logits[rows])
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Categorical]) -> Categorical:
+        """Return the distribution of all rows of several, which one policy made."""
+        return cls(torch.cat([part.logits for part in parts]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import gymnasium
@@ -97,7 +98,7 @@ class Network(nn.Module):
             return None
         with self._precision(next(iter(frames.values())).device):
             parts = [encoder(frames[name]) for name, encoder in self.frame_encoders.items()]
-            features = torch.cat(parts, dim=1)
+            features = _joined(parts)
             return (features if self.vector_encoders else self.trunk(features)).float()
 
     def forward(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
@@ -114,14 +115,15 @@ class Network(nn.Module):
             frame_features: (B, f) what `encode_frames` said of their frames, where it is known.
 
         Returns:
-            (B, features_dim), and the state (S, state_size) after the last of each sequence.
+            (B, features_dim), and the state (S, state_size) after the last of each sequence;
+            (B, 0) without memory.
         """
         hidden = self._react(observations, frame_features)
+        if self.memory is None:
+            return hidden, hidden.new_empty(len(hidden), 0)
         sequences = observations.sequences
         if sequences is None:
             sequences = Sequences.single(hidden.new_zeros(len(hidden), self.state_size))
-        if self.memory is None:
-            return hidden, sequences.state
         recalled: tuple[Tensor, Tensor] = self.memory(hidden, sequences)
         return recalled
 
@@ -137,10 +139,11 @@ class Network(nn.Module):
         vectors = observations.vectors
         with self._precision(next(iter(vectors.values())).device):
             parts += [encoder(vectors[name]) for name, encoder in self.vector_encoders.items()]
-            return self.trunk(torch.cat(parts, dim=1)).float()
+            return self.trunk(_joined(parts)).float()
 
-    def _precision(self, device: torch.device) -> torch.autocast:
-        return torch.autocast(device.type, torch.bfloat16, enabled=self._lowered)
+    def _precision(self, device: torch.device) -> AbstractContextManager[None]:
+        # Entering autocast costs time even where it is not enabled.
+        return torch.autocast(device.type, torch.bfloat16) if self._lowered else nullcontext()
 
     def update_statistics(self, vectors: Mapping[str, Tensor]) -> None:
         """Shows vectors (B, n) to the encoders that standardise."""
@@ -210,6 +213,11 @@ class NetworkFactory:
         except ValueError as error:
             raise UserError(f"encoders.{name} ({component.name}): {error}") from error
         return encoder
+
+
+def _joined(parts: Sequence[Tensor]) -> Tensor:
+    """Features side by side."""
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts), dim=1)
 
 
 def _orthogonal(layer: nn.Linear, gain: float) -> nn.Linear:

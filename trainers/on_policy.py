@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from trainers.distributions import Distribution
 from trainers.interaction import Interaction, Step
 from trainers.memory import Sequences, number_sequences
 from trainers.observations import Observations, frames_differ, to_tensors
@@ -63,6 +64,9 @@ class OnPolicyCollector:
         last = self._tensors(self._interaction.observations, self._remembered)
         advantages, returns = self._estimate(moments, self._policy.value(last), gamma, lambd)
         frame_index = torch.cat([moment.frame_index for moment in moments])
+        actions = torch.cat([moment.actions for moment in moments])
+        policies = [moment.distribution for moment in moments]
+        distribution = type(policies[0]).concatenate(policies)
         return Rollout(
             frames=frames.tensors(),
             frame_index=frame_index,
@@ -72,8 +76,8 @@ class OnPolicyCollector:
                 name: torch.cat([moment.vectors[name] for moment in moments])
                 for name in moments[0].vectors
             },
-            actions=torch.cat([moment.actions for moment in moments]),
-            log_probs=torch.cat([moment.log_probs for moment in moments]),
+            actions=actions,
+            log_probs=distribution.log_prob(actions),
             values=torch.cat([moment.values for moment in moments]),
             advantages=advantages.flatten(),
             returns=returns.flatten(),
@@ -103,13 +107,14 @@ class OnPolicyCollector:
             actions = distribution.sample(self._generator)
         step = self._interaction.step(to_environment(actions, self._action_space))
         frames.new = np.flatnonzero(~step.same_frame)
-        self._remembered = after.masked_fill(self._tensor(step.done)[:, None], 0.0)
+        if self._policy.state_size:
+            self._remembered = after.masked_fill(self._tensor(step.done)[:, None], 0.0)
         return _Moment(
             frame_index=frame_index,
             vectors=observations.vectors,
             state=state,
             actions=actions,
-            log_probs=distribution.log_prob(actions),
+            distribution=distribution,
             values=values,
             final_values=self._final_values(raw, frames, step, after),
             step=step,
@@ -123,6 +128,8 @@ class OnPolicyCollector:
     ) -> Observations:
         """Observations in all environments or some, with what is remembered before them (B, m)."""
         observations = to_tensors(raw, self._space, self._device, rows)
+        if not self._policy.state_size:
+            return observations
         return replace(observations, sequences=Sequences.single(state))
 
     def _final_values(
@@ -194,7 +201,7 @@ class _Moment:
     vectors: dict[str, Tensor]
     state: Tensor
     actions: Tensor
-    log_probs: Tensor
+    distribution: Distribution
     values: Tensor
     final_values: Tensor
     step: Step

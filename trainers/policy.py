@@ -94,6 +94,7 @@ class ActorCritic(nn.Module):
         width = self.actor.features_dim
         self.action_head: nn.Linear
         self.log_std: nn.Parameter | None = None
+        self._min_log_std: Tensor
         match factory.action_space:
             case gymnasium.spaces.Box(shape=(size,)):
                 self.action_head = head(width, size, ACTOR_GAIN)
@@ -106,7 +107,8 @@ class ActorCritic(nn.Module):
                     f"environment: actions of the space {other} are not supported; a Box of one "
                     "dimension and Discrete are"
                 )
-        self._min_log_std = math.log(settings.min_std)
+        min_log_std = torch.tensor(math.log(settings.min_std))
+        self.register_buffer("_min_log_std", min_log_std, persistent=False)
         self.value_head = head(
             width if self.critic is None else self.critic.features_dim, 1, CRITIC_GAIN
         )
@@ -175,8 +177,7 @@ class ActorCritic(nn.Module):
         if self.log_std is None:
             return Categorical(outputs)
         # std = min_std + exp(log_std): a floor that, unlike a clamp, always lets gradients through.
-        floor = torch.tensor(self._min_log_std, device=outputs.device)
-        return DiagonalGaussian(outputs, torch.logaddexp(self.log_std, floor))
+        return DiagonalGaussian(outputs, torch.logaddexp(self.log_std, self._min_log_std))
 
     def _value(self, hidden: Tensor) -> Tensor:
         value: Tensor = self.value_head(hidden).squeeze(-1)

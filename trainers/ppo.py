@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import chain
 
 import torch
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 
 from trainers.algorithm import TrainerSettings
 from trainers.distributions import Distribution
@@ -67,7 +68,11 @@ class PPO(OnPolicyAlgorithm):
     ):
         self._hyperparameters = settings.hyperparameters
         policy = ActorCritic(factory, settings.network_settings).to(device)
-        groups = (policy.actor_parameters(), policy.critic_parameters())
+        actor, critic = policy.actor_parameters(), policy.critic_parameters()
+        # A step of the optimiser costs by the group: one where actor and critic share their rate.
+        groups: tuple[Iterable[nn.Parameter], ...] = (chain(actor, critic),)
+        if settings.hyperparameters.critic_learning_rate is not None:
+            groups = (actor, critic)
         super().__init__(policy, groups, settings.hyperparameters, interaction, generator, device)
 
     def update(self, progress: float) -> Mapping[str, float]:
@@ -90,8 +95,8 @@ class PPO(OnPolicyAlgorithm):
         critic_rate = hyper.learning_rate_schedule.value(
             hyper.critic_learning_rate or hyper.learning_rate, progress
         )
-        actor, critic = self._optimizer.param_groups
-        actor["lr"], critic["lr"] = rate, critic_rate
+        for group, value in zip(self._optimizer.param_groups, (rate, critic_rate), strict=False):
+            group["lr"] = value
         return {
             "Policy/Learning Rate": rate,
             "Policy/Critic Learning Rate": critic_rate,
@@ -121,12 +126,14 @@ class PPO(OnPolicyAlgorithm):
                 values, rollout.values[rows], rollout.returns[rows], hyper.value_clipping
             )
             entropy = distribution.entropy().mean()
-            loss = (
-                policy_loss
-                + hyper.value_coefficient * value_loss
-                - schedules["Policy/Beta"] * entropy
-                + hyper.kl_penalty * statistics["Policy/KL"]
-            )
+            # L = L_clip + c_v L_value - beta H + c_kl KL
+            loss = policy_loss + hyper.value_coefficient * value_loss
+            for weight, term in (
+                (-schedules["Policy/Beta"], entropy),
+                (hyper.kl_penalty, statistics["Policy/KL"]),
+            ):
+                if weight:  # the gradient of what weighs nothing costs as much as any
+                    loss = loss + weight * term
             self._descend(loss)
             statistics |= {
                 "Losses/Policy Loss": policy_loss,
@@ -165,7 +172,7 @@ def surrogate_loss(
     loss = -torch.min(ratio * advantages, clipped * advantages).mean()
     # KL(old || new) = E_old[(r - 1) - log r]: never negative, and of low variance.
     divergence = ((ratio - 1.0) - log_ratio).mean()
-    clip_fraction = ((ratio - 1.0).abs() > epsilon).float().mean()
+    clip_fraction = ((ratio.detach() - 1.0).abs() > epsilon).float().mean()
     return loss, {"Policy/KL": divergence, "Policy/Clip Fraction": clip_fraction}
 
 

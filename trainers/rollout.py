@@ -94,10 +94,15 @@ class Rollout:
         """
         chosen, index = self._frames_of(rows)
         vectors = {name: values[rows] for name, values in self.vectors.items()}
+        return Observations(chosen, vectors, index, self._sequences_of(rows))
+
+    def _sequences_of(self, rows: Tensor) -> Sequences | None:
+        """The sequences that some rows make up; None where nothing is remembered."""
+        if not self.states.shape[1]:
+            return None
         _, lengths = self.groups[rows].unique_consecutive(return_counts=True)
         first = rows[lengths.cumsum(0) - lengths]
-        sequences = Sequences(lengths.cpu(), self.states[first])
-        return Observations(chosen, vectors, index, sequences)
+        return Sequences(lengths.cpu(), self.states[first])
 
     def _frames_of(self, rows: Tensor) -> tuple[dict[str, Tensor], Tensor | None]:
         """The frames of some rows; where rows share them each once, and which is whose."""

@@ -181,6 +181,18 @@ def test_rows(p: Distribution, q: Distribution, rows):
     assert p[rows].entropy().shape == (3,)
 
 
+@pytest.mark.parametrize(("p", "q"), PAIRS)
+def test_rows_come_together_again(p: Distribution, q: Distribution):
+    count = len(p.mode())
+    for distribution in (p, q):
+        parts = [distribution[:2], distribution[2:3], distribution[3:]]
+        whole = type(distribution).concatenate(parts)
+        actions = distribution.sample()
+        assert len(whole.mode()) == count
+        assert torch.equal(whole.mode(), distribution.mode())
+        assert torch.equal(whole.log_prob(actions), distribution.log_prob(actions))
+
+
 def test_as_many_rows_as_dimensions_is_not_mistaken_for_shared():
     p = gaussian(1, rows=3, actions=3, shared=True)
     rows = torch.tensor([2, 0])

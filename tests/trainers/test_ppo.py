@@ -198,8 +198,14 @@ def test_schedules_reach_the_optimizer_and_the_statistics(make_ppo: MakePPO) -> 
 def test_the_critic_has_the_policys_learning_rate_unless_it_has_its_own(
     make_ppo: MakePPO,
 ) -> None:
-    _, descent = one_round(make_ppo("target", {"learning_rate": 1e-2}, SEPARATE))
-    assert descent.rates[0] == pytest.approx([1e-2, 1e-2])
+    algorithm = make_ppo("target", {"learning_rate": 1e-2}, SEPARATE)
+    policy = algorithm.policy
+    actor, critic = snapshot(policy.actor_parameters()), snapshot(policy.critic_parameters())
+    statistics, descent = one_round(algorithm)
+    assert {rate for rates in descent.rates for rate in rates} == {1e-2}
+    assert statistics["Policy/Critic Learning Rate"] == 1e-2
+    assert changed(actor, policy.actor_parameters())
+    assert changed(critic, policy.critic_parameters())
 
 
 @pytest.mark.parametrize(
