@@ -11,19 +11,15 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
-import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from benchmarks.contest.cases import CASES, SIDES, Case, Job
+from benchmarks.contest.cases import CASES, SIDES, Entry
 from benchmarks.contest.report import draw, summaries, table, write_page
-
-ROOT = Path(__file__).parents[1]
+from benchmarks.jobs import Job, run_missing
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,12 +31,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if case.algorithm in options.algorithms and case.task in options.tasks
     ]
     # Side by side with its peer, so that both meet the same moods of the machine.
-    jobs = [Job(case, side, seed) for case in cases for seed in options.seeds for side in SIDES]
-    missing = [job for job in jobs if not _file(options.results, job).exists()]
-    options.results.mkdir(parents=True, exist_ok=True)
-    with ThreadPoolExecutor(options.jobs) as pool:
-        codes = list(pool.map(lambda job: _run(job, options.results), missing))
-    return max(codes, default=0) or report(options, jobs)
+    entries = [
+        Entry(case, side, seed) for case in cases for seed in options.seeds for side in SIDES
+    ]
+    code = run_missing([_job(entry, options.results) for entry in entries], options.jobs)
+    return code or report(options, entries)
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -58,10 +53,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def report(options: argparse.Namespace, jobs: Sequence[Job]) -> int:
+def report(options: argparse.Namespace, entries: Sequence[Entry]) -> int:
     """Prints the table, and writes page and pictures where asked."""
     results: list[dict[str, Any]] = [
-        json.loads(_file(options.results, job).read_text()) for job in jobs
+        json.loads(_job(entry, options.results).results.read_text()) for entry in entries
     ]
     found = summaries(results)
     Console().print(table(found))
@@ -73,20 +68,12 @@ def report(options: argparse.Namespace, jobs: Sequence[Job]) -> int:
     return 0
 
 
-def _run(job: Job, results: Path) -> int:
-    """Does a job in a process of its own; returns its exit code."""
-    case: Case = job.case
-    command = [sys.executable, "-m", "benchmarks.contest.run", case.algorithm, case.task]
-    command += [str(case.steps), job.side, str(job.seed), "--to", str(_file(results, job))]
-    print(f"{job.name} begins", flush=True)
-    done = subprocess.run(command, cwd=ROOT, check=False, stderr=subprocess.PIPE, text=True)
-    if done.returncode:
-        print(f"{job.name} failed:\n{done.stderr}", file=sys.stderr)
-    return done.returncode
-
-
-def _file(results: Path, job: Job) -> Path:
-    return results.resolve() / f"{job.name}.json"
+def _job(entry: Entry, results: Path) -> Job:
+    """One run of one side, in a process of its own."""
+    case, file = entry.case, results.resolve() / f"{entry.name}.json"
+    command = ["-m", "benchmarks.contest.run", case.algorithm, case.task, str(case.steps)]
+    command += [entry.side, str(entry.seed), "--to", str(file)]
+    return Job(entry.name, [command], file)
 
 
 if __name__ == "__main__":

@@ -50,8 +50,8 @@ CASES = (
 
 
 @dataclass(frozen=True)
-class Job:
-    """One run of one side."""
+class Entry:
+    """One run of one side in a case."""
 
     case: Case
     side: str

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from benchmarks.contest.cases import OURS, PEER, PEER_NAMES, SIDES
+from benchmarks.page import markdown, write_between
 
+HEAD = ("task", "steps", "algorithm", "ventosa", "peer", "ventosa steps/s", "peer's")
 COLORS = {OURS: "#0b6fb8", PEER: "#c1571b"}
 # Student's t for 95 % of both sides together, by degrees of freedom.
 STUDENT_T = {1: 12.706, 2: 4.303, 3: 3.182, 4: 2.776, 5: 2.571, 6: 2.447, 7: 2.365, 8: 2.306}
@@ -75,7 +77,7 @@ def half_interval(values: Sequence[float]) -> float:
 def table(found: Sequence[Summary]) -> Table:
     """The figures for people."""
     result = Table(title="mean final return (95 % confidence) and steps/s while training")
-    for column in ("task", "steps", "algorithm", "ventosa", "peer", "ventosa steps/s", "peer's"):
+    for column in HEAD:
         result.add_column(column, justify="left" if column in {"task", "algorithm"} else "right")
     for row in _rows(found):
         result.add_row(*row)
@@ -84,14 +86,7 @@ def table(found: Sequence[Summary]) -> Table:
 
 def write_page(path: Path, found: Sequence[Summary], seeds: int) -> None:
     """Writes the figures between the markers of a Markdown page, which must be there."""
-    head = "| task | steps | algorithm | ventosa | peer | ventosa steps/s | peer's |"
-    lines = [head, "|---|---|---|---|---|---|---|"]
-    lines += ["| " + " | ".join(row) + " |" for row in _rows(found)]
-    lines += ["", f"{seeds} seeds each."]
-    begin, end = "<!-- learning -->\n", "<!-- end of learning -->"
-    before, _, rest = path.read_text().partition(begin)
-    _, _, after = rest.partition(end)
-    path.write_text(before + begin + "\n".join(lines) + "\n" + end + after)
+    write_between(path, "learning", [*markdown(HEAD, _rows(found)), "", f"{seeds} seeds each."])
 
 
 def _rows(found: Sequence[Summary]) -> list[list[str]]:

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-# One thread each: small networks gain nothing from a second, and runs go side by side.
-os.environ["OMP_NUM_THREADS"] = "1"
-
 from benchmarks.contest import ours, theirs
-from benchmarks.contest.cases import OURS, PEER, SIDES, Case, Job
+from benchmarks.contest.cases import OURS, PEER, SIDES, Case, Entry
 from benchmarks.contest.evaluation import Referee, returns
 from trainers.files import write_atomically
 from trainers.plugins import load_registries
@@ -37,26 +33,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--to", type=Path, required=True, help="the file of results")
     options = parser.parse_args(arguments)
     case = Case(options.algorithm, options.task, options.steps)
-    play(Job(case, options.side, options.seed), options.to)
+    play(Entry(case, options.side, options.seed), options.to)
     return 0
 
 
-def play(job: Job, path: Path) -> None:
-    """Does one job, and writes its results as JSON."""
+def play(entry: Entry, path: Path) -> None:
+    """Does one run, and writes its results as JSON."""
     registries = load_registries()
-    overrides = [f"trainer.max_steps={job.case.steps}", f"seed={job.seed}"]
-    run = load_run(job.case.run_file, overrides, registries)
+    overrides = [f"trainer.max_steps={entry.case.steps}", f"seed={entry.seed}"]
+    run = load_run(entry.case.run_file, overrides, registries)
     judged = load_run(
-        job.case.run_file, [*overrides, f"environment.num_envs={EVALUATION_ENVS}"], registries
+        entry.case.run_file, [*overrides, f"environment.num_envs={EVALUATION_ENVS}"], registries
     )
-    env = build_environment(judged, job.seed)
-    referee = Referee(env, max(1, job.case.steps // EVALUATIONS))
-    act = LEARNERS[job.side](run, registries, referee)
+    env = build_environment(judged, entry.seed)
+    referee = Referee(env, max(1, entry.case.steps // EVALUATIONS))
+    act = LEARNERS[entry.side](run, registries, referee)
     seconds = referee.stop()
     final = returns(env, act, FINAL_EPISODES_EACH)
     env.close()
     result = {
-        **asdict(job),
+        **asdict(entry),
         "seconds": seconds,
         "final_return": float(final.mean()),
         "curve": referee.curve,

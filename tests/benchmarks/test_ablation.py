@@ -1,0 +1,64 @@
+"""The recipe with one change at a time."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import ablation
+from trainers.plugins import load_registries
+from trainers.settings import load_run
+
+
+@pytest.mark.parametrize("change", ablation.CHANGES[1:], ids=lambda change: change.slug)
+def test_every_change_changes_one_section(change: ablation.Change) -> None:
+    registries = load_registries()
+    as_it_is = load_run(ablation.RUN_FILE, (), registries)
+    changed = load_run(ablation.RUN_FILE, change.overrides, registries)
+    sections = [
+        field.name
+        for field in fields(as_it_is)
+        if getattr(as_it_is, field.name) != getattr(changed, field.name)
+    ]
+    assert sections
+    # The paper's encoder has a learning rate of its own, or it learns nothing at all.
+    assert len(sections) == 1 or change.slug == "paper-encoder"
+
+
+def report(success: float) -> dict[str, Any]:
+    return {
+        "first_action_success": success,
+        "position_error_m": {"median": success / 100.0, "p95": 0.02, "x": 0.0},
+        "yaw_error_deg": {"median": 0.5, "p95": 1.5},
+    }
+
+
+ROW = ["none: config/run.yaml", "60.0 % (50.0 to 70.0)", "6.0 / 20.0", "0.50 / 1.50"]
+
+
+def test_a_row_by_hand() -> None:
+    assert ablation.row(ablation.CHANGES[0], [report(0.5), report(0.7)]) == ROW
+
+
+def test_the_page_gets_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for seed, success in ((4, 0.5), (5, 0.7)):
+        (tmp_path / f"none-1000-{seed}.json").write_text(json.dumps(report(success)))
+    page = tmp_path / "page.md"
+    page.write_text("<!-- ablation -->\n<!-- end of ablation -->\n")
+    chosen = ["--changes", "none", "--seeds", "4", "5", "--steps", "1000"]
+    assert ablation.main([*chosen, "--results", str(tmp_path), "--page", str(page)]) == 0
+    assert "| " + " | ".join(ROW) + " |" in page.read_text()
+    assert "1,000 steps, 2 seeds" in capsys.readouterr().out
+
+
+def test_a_run_is_trained_then_evaluated(tmp_path: Path) -> None:
+    job = ablation.job_of(ablation.Change("x", "y", ("a.b=1",)), 7, 1000, tmp_path)
+    learn, evaluate = job.commands
+    assert learn[:2] == ["-m", "trainers.learn"]
+    assert {"a.b=1", "trainer.max_steps=1000", "x-1000-7", "7"} <= set(learn)
+    assert evaluate[-2:] == ["--json", str(tmp_path / "x-1000-7.json")]
+    assert str(tmp_path / "runs" / "x-1000-7") in evaluate

@@ -1,0 +1,21 @@
+"""Tables in pages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.page import markdown, write_between
+
+
+def test_a_table_by_hand() -> None:
+    assert markdown(["a", "b"], [["1", "2"]]) == ["| a | b |", "| --- | --- |", "| 1 | 2 |"]
+
+
+def test_a_page_without_a_place_is_left_alone(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- table -->\nno end\n")
+    with pytest.raises(ValueError, match=r"page\.md: there is no place"):
+        write_between(page, "table", ["new"])
+    assert page.read_text() == "before\n<!-- table -->\nno end\n"
