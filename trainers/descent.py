@@ -33,8 +33,10 @@ def descend(
     gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
     for parameter, gradient in zip(parameters, gradients, strict=True):
         parameter.grad = gradient
-    norm = nn.utils.clip_grad_norm_(parameters, max_gradient_norm)
+    norm = nn.utils.get_total_norm([part for part in gradients if part is not None])
     check_finite(loss, norm, step)
+    if norm > max_gradient_norm:
+        nn.utils.clip_grads_with_norm_(parameters, max_gradient_norm, norm)
     optimizer.step()
 
 

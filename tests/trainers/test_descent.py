@@ -38,3 +38,12 @@ def test_what_is_not_finite_changes_nothing(scale: float) -> None:
     with pytest.raises(NonFiniteError, match=r"^step 7: the loss is .*, its gradient's norm"):
         descend(torch.optim.SGD([weight], lr=1.0), weight * scale * 1e9, [weight], 1.0, 7)
     assert weight.item() == pytest.approx(1e-25)
+
+
+def test_what_the_loss_does_not_know_stays_as_it_is() -> None:
+    known, unknown = nn.Parameter(torch.ones(())), nn.Parameter(torch.ones(()))
+    optimizer = torch.optim.Adam([known, unknown], lr=0.1)
+    for _ in range(2):  # the second time, too, when it could have a gradient of the first
+        descend(optimizer, 2.0 * known, [known, unknown], INFINITE, 7)
+    assert known.item() == pytest.approx(0.8)
+    assert (unknown.item(), unknown.grad) == (1.0, None)
