@@ -136,7 +136,9 @@ def job_of(change: Change, seed: int, steps: int, results: Path) -> Job:
     name, folder = f"{change.slug}-{steps}-{seed}", results.resolve()
     file = folder / f"{name}.json"
     learn = ["-m", "trainers.learn", str(RUN_FILE), *change.overrides]
-    learn += [f"trainer.max_steps={steps}", "--seed", str(seed), "--run-id", name]
+    # One checkpoint, the last: the best of several would be of another step in every row.
+    learn += [f"trainer.max_steps={steps}", f"trainer.checkpoint_interval={steps}"]
+    learn += ["--seed", str(seed), "--run-id", name]
     # What an interrupted run left has no results; it begins anew.
     learn += ["--results-dir", str(folder / "runs"), "--force"]
     evaluate = ["-m", "trainers.evaluate", str(folder / "runs" / name), "--json", str(file)]
