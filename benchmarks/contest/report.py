@@ -13,15 +13,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
+from scipy.special import stdtrit
 
 from benchmarks.contest.cases import OURS, PEER, PEER_NAMES, SIDES
 from benchmarks.page import markdown, write_between
 
 HEAD = ("task", "steps", "algorithm", "ventosa", "peer", "ventosa steps/s", "peer's")
 COLORS = {OURS: "#0b6fb8", PEER: "#c1571b"}
-# Student's t for 95 % of both sides together, by degrees of freedom.
-STUDENT_T = {1: 12.706, 2: 4.303, 3: 3.182, 4: 2.776, 5: 2.571, 6: 2.447, 7: 2.365, 8: 2.306}
-NORMAL = 1.96
 Result = Mapping[str, Any]
 
 
@@ -70,8 +68,8 @@ def half_interval(values: Sequence[float]) -> float:
     """Half the width of the 95 % confidence interval of a mean, by Student's t."""
     if len(values) < 2:
         return math.nan
-    factor = STUDENT_T.get(len(values) - 1, NORMAL)
-    return factor * statistics.stdev(values) / math.sqrt(len(values))
+    factor = stdtrit(len(values) - 1, 0.975)
+    return float(factor) * statistics.stdev(values) / math.sqrt(len(values))
 
 
 def table(found: Sequence[Summary]) -> Table:

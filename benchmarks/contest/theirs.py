@@ -22,6 +22,7 @@ from benchmarks.peers import PeerVecEnv
 from trainers.ddpg import DDPGSettings
 from trainers.networks import ACTIVATIONS, NetworkSettings
 from trainers.plugins import Registries
+from trainers.policy import PolicySettings
 from trainers.ppo import PPOSettings
 from trainers.schedules import Schedule
 from trainers.session import build_environment
@@ -92,7 +93,7 @@ def _ppo(settings: PPOSettings, env: VecEnv, seed: int) -> PPO:
         vf_coef=hyper.value_coefficient,
         max_grad_norm=hyper.max_gradient_norm,
         target_kl=hyper.target_kl,
-        policy_kwargs=_networks(networks) | _log_std(networks.initial_std, env),
+        policy_kwargs=_actor_critic(networks, env),
         seed=seed,
         device="cpu",
     )
@@ -100,6 +101,9 @@ def _ppo(settings: PPOSettings, env: VecEnv, seed: int) -> PPO:
 
 def _trpo(settings: TRPOSettings, env: VecEnv, seed: int) -> TRPO:
     hyper, networks = settings.hyperparameters, settings.network_settings
+    # Of a Gaussian policy sb3-contrib takes the mean KL of the action's dimensions, not their sum,
+    # and so the mean of their Fisher matrices: both bounds per dimension make it the same step.
+    dimensions = math.prod(env.action_space.shape or ())
     return TRPO(
         "MlpPolicy",
         env,
@@ -108,14 +112,14 @@ def _trpo(settings: TRPOSettings, env: VecEnv, seed: int) -> TRPO:
         batch_size=hyper.batch_size,
         gamma=hyper.gamma,
         cg_max_steps=hyper.cg_iterations,
-        cg_damping=hyper.damping,
+        cg_damping=hyper.damping / dimensions,
         line_search_shrinking_factor=hyper.backtrack_coefficient,
         line_search_max_iter=hyper.backtrack_iterations,
         n_critic_updates=hyper.num_epoch,
         gae_lambda=hyper.lambd,
-        target_kl=hyper.delta,
+        target_kl=hyper.delta / dimensions,
         sub_sampling_factor=round(1 / hyper.fisher_fraction),
-        policy_kwargs=_networks(networks) | _log_std(networks.initial_std, env),
+        policy_kwargs=_actor_critic(networks, env),
         seed=seed,
         device="cpu",
     )
@@ -149,20 +153,21 @@ _BUILDERS: dict[type, Callable[..., BaseAlgorithm]] = {
 }
 
 
-def _networks(settings: NetworkSettings) -> dict[str, Any]:
-    activation = type(ACTIVATIONS[settings.activation]())
+def _networks(settings: NetworkSettings, **optimizer: float) -> dict[str, Any]:
     return {
         "net_arch": [settings.hidden_units] * settings.num_layers,
-        "activation_fn": activation,
+        "activation_fn": type(ACTIVATIONS[settings.activation]()),
         # Ours has the same: one call of a fused kernel instead of one for each tensor.
-        "optimizer_kwargs": {"fused": True},
+        "optimizer_kwargs": {"fused": True, **optimizer},
         "optimizer_class": torch.optim.Adam,
     }
 
 
-def _log_std(initial_std: float, env: VecEnv) -> dict[str, float]:
-    continuous = isinstance(env.action_space, gymnasium.spaces.Box)
-    return {"log_std_init": math.log(initial_std)} if continuous else {}
+def _actor_critic(settings: PolicySettings, env: VecEnv) -> dict[str, Any]:
+    networks = _networks(settings, eps=1e-5)  # their default, which other arguments take away
+    if isinstance(env.action_space, gymnasium.spaces.Box):
+        networks["log_std_init"] = math.log(settings.initial_std)
+    return networks
 
 
 def _course(initial: float, schedule: Schedule) -> Callable[[float], float]:

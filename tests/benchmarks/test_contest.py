@@ -16,6 +16,7 @@ from benchmarks.contest.evaluation import Referee, returns
 from envs.environment import Environment
 
 pytest.importorskip("matplotlib")
+pytest.importorskip("scipy")
 
 from benchmarks.contest.report import draw, half_interval, summaries, write_page
 
@@ -75,8 +76,9 @@ def test_the_referee_looks_at_intervals_and_stops_the_clock(
 
 
 def test_the_interval_by_hand() -> None:
-    # Mean 2, deviation 1, of three: 4.303 / sqrt(3)
-    assert half_interval([1.0, 2.0, 3.0]) == pytest.approx(4.303 / math.sqrt(3.0))
+    # Student's t for 2 and 9 degrees of freedom, from a printed table.
+    assert half_interval([1.0, 2.0, 3.0]) == pytest.approx(4.303 / math.sqrt(3.0), rel=1e-3)
+    assert half_interval([-1.0, 1.0] * 5) == pytest.approx(2.262 / 3.0, rel=1e-3)
     assert math.isnan(half_interval([1.0]))
 
 
