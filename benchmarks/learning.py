@@ -32,7 +32,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ]
     # Side by side with its peer, so that both meet the same moods of the machine.
     entries = [
-        Entry(case, side, seed) for case in cases for seed in options.seeds for side in SIDES
+        Entry(case, side, seed)
+        for case in cases
+        for seed in options.seeds or range(case.seeds)
+        for side in SIDES
     ]
     code = run_missing([_job(entry, options.results) for entry in entries], options.jobs)
     return code or report(options, entries)
@@ -45,7 +48,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.learning", description=__doc__)
     parser.add_argument("--algorithms", nargs="+", choices=algorithms, default=algorithms)
     parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--seeds", nargs="+", type=int, help="instead of each case's own")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), help="at a time")
     parser.add_argument("--results", type=Path, default=Path("results/learning"), metavar="DIR")
     parser.add_argument("--page", type=Path, metavar="FILE", help="write the table as Markdown")
@@ -64,7 +67,7 @@ def report(options: argparse.Namespace, entries: Sequence[Entry]) -> int:
         options.pictures.mkdir(parents=True, exist_ok=True)
         draw(results, options.pictures)
     if options.page is not None:
-        write_page(options.page, found, len(options.seeds))
+        write_page(options.page, found)
     return 0
 
 

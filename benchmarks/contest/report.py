@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 from benchmarks.contest.cases import OURS, PEER, PEER_NAMES, SIDES
 from benchmarks.page import markdown, write_between
 
-HEAD = ("task", "steps", "algorithm", "ventosa", "peer", "ventosa steps/s", "peer's")
+HEAD = ("task", "steps", "algorithm", "seeds", "ventosa", "peer", "ventosa steps/s", "peer's")
 COLORS = {OURS: "#0b6fb8", PEER: "#c1571b"}
 Result = Mapping[str, Any]
 
@@ -45,6 +45,7 @@ class Summary:
     algorithm: str
     task: str
     steps: int
+    seeds: int
     sides: Mapping[str, Side]
 
 
@@ -52,7 +53,11 @@ def summaries(results: Sequence[Result]) -> list[Summary]:
     """The cases in the order they come."""
     return [
         Summary(
-            algorithm, task, steps, {side: _side(runs[side], steps) for side in SIDES if runs[side]}
+            algorithm,
+            task,
+            steps,
+            len(runs[OURS]),
+            {side: _side(runs[side], steps) for side in SIDES if runs[side]},
         )
         for (algorithm, task, steps), runs in _by_case(results).items()
     ]
@@ -82,9 +87,9 @@ def table(found: Sequence[Summary]) -> Table:
     return result
 
 
-def write_page(path: Path, found: Sequence[Summary], seeds: int) -> None:
+def write_page(path: Path, found: Sequence[Summary]) -> None:
     """Writes the figures between the markers of a Markdown page, which must be there."""
-    write_between(path, "learning", [*markdown(HEAD, _rows(found)), "", f"{seeds} seeds each."])
+    write_between(path, "learning", markdown(HEAD, _rows(found)))
 
 
 def _rows(found: Sequence[Summary]) -> list[list[str]]:
@@ -93,6 +98,7 @@ def _rows(found: Sequence[Summary]) -> list[list[str]]:
             case.task,
             f"{case.steps:,}",
             case.algorithm,
+            str(case.seeds),
             *(_return(case.sides.get(side)) for side in SIDES),
             *(_speed(case.sides.get(side)) for side in SIDES),
         ]

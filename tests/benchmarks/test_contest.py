@@ -108,11 +108,11 @@ def test_a_summary_has_means_and_speeds_of_both_sides() -> None:
 def test_the_page_keeps_what_is_around_the_table(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- learning -->\nold\n<!-- end of learning -->\nafter\n")
-    write_page(page, summaries(RESULTS), 3)
+    write_page(page, summaries(RESULTS))
     text = page.read_text()
     assert text.startswith("before\n<!-- learning -->\n| task |")
     assert text.endswith("<!-- end of learning -->\nafter\n")
-    assert "| pendulum | 1,000 | ppo | -160 ± 25 | -170 ± 25 | 333 | 333 |" in text
+    assert "| pendulum | 1,000 | ppo | 3 | -160 ± 25 | -170 ± 25 | 333 | 333 |" in text
     assert "old" not in text
 
 
