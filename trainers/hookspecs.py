@@ -44,6 +44,7 @@ def ventosa_curricula() -> dict[str, type]:  # type: ignore[empty-body]
 
     It is built as `cls(settings)`, and is pure: its state is plain data, made by `initial_state()`,
     replaced by `advance(state, episodes)`, and read by `lesson(state)` and `parameters(state)`.
+    Policies are judged on `final_parameters()`.
     """
 
 

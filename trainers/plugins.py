@@ -38,7 +38,7 @@ BUILT_IN_PLUGINS = (
     "envs.plugin",
     "trainers.plugin",
 )
-CURRICULUM_METHODS = ("initial_state", "advance", "lesson", "parameters")
+CURRICULUM_METHODS = ("initial_state", "advance", "lesson", "parameters", "final_parameters")
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ class GoodEncoder(nn.Module):
 
 class GoodCurriculum:
     Settings = Empty
-    initial_state = advance = lesson = parameters = lambda self: None
+    initial_state = advance = lesson = parameters = final_parameters = lambda self: None
 
 
 class GoodEnvironment(Environment):
@@ -180,6 +180,13 @@ def call(self: Any) -> None: ...
             "curricula",
             component("C", Settings=Empty, initial_state=call, advance=call, lesson=call),
             "C has no method parameters",
+        ),
+        (
+            "curricula",
+            component(
+                "C", Settings=Empty, initial_state=call, advance=call, lesson=call, parameters=call
+            ),
+            "C has no method final_parameters",
         ),
         (
             "environments",
