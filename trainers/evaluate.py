@@ -22,7 +22,13 @@ UNITS = {
     "yaw_error_deg": ("deg", 1.0),
     "pick_failures": ("%", 100.0),
 }
-RATES = ("success", "first_action_success", "collision_rate", "pick_rate")
+RATES = (
+    "success",
+    "collision_rate",
+    "first_action_success",
+    "first_action_collision_rate",
+    "pick_rate",
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

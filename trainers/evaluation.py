@@ -32,7 +32,7 @@ from trainers.settings import RunSettings, load_run
 # Run files take seeds below this, so that no run was ever trained on an evaluation's scenes.
 FIRST_SEED = 2**32
 FIRST_ACTION, WHOLE_EPISODE = 0, 1
-POSITION_ERROR = "position_error_m"
+COLLISION, POSITION_ERROR = "collision", "position_error_m"
 
 
 def evaluate(
@@ -49,7 +49,8 @@ def evaluate(
     """Evaluates a policy on the last lesson's task.
 
     Where the first action is to be right, as in grasping, it is judged by itself, and the whole
-    episodes are played as in training. Elsewhere they are played by the deterministic policy.
+    episodes are played as at the end of training: with actions that are drawn, or bear what
+    exploration noise was left. Elsewhere they are played by the deterministic policy.
 
     Args:
         policy: a run's folder or id, or a checkpoint's folder.
@@ -64,9 +65,10 @@ def evaluate(
 
     Returns:
         What is known of: `episodes`, `seed`; of the deterministic policy's first action
-        `first_action_success`, `collision_rate`, `position_error_m`, `yaw_error_deg`, and, after
-        `pick`, `pick_rate` and the shares of `pick_failures`; and of the whole episodes `success`,
-        the means `reward` and `episode_length`, and `reward_std`.
+        `first_action_success`, `first_action_collision_rate`, `position_error_m`, `yaw_error_deg`,
+        and, after `pick`, `pick_rate` and the shares of `pick_failures`; and of the whole episodes
+        `success`, `collision_rate` (the share of episodes with an undesired collision), the means
+        `reward` and `episode_length`, and `reward_std`.
 
     Raises:
         UserError: there is no such policy, it does not fit its configuration, or what is asked for
@@ -192,9 +194,10 @@ def _whole_episodes(player: _Player, episodes: int, *, deterministic: bool) -> d
         parts.append(finished[ended[done] < share[done]])
         ended[done] += 1
     played = concatenate(parts)
-    success = {"success": float(played.successes.mean())} if SUCCESS in played.measures else {}
+    means = {name: float(values.mean()) for name, values in played.measures.items()}
+    rates = (("success", SUCCESS), ("collision_rate", COLLISION))
     return {
-        **success,
+        **{key: means[name] for key, name in rates if name in means},
         "reward": float(played.rewards.mean()),
         "reward_std": float(played.rewards.std()),
         "episode_length": float(played.lengths.mean()),
@@ -230,7 +233,7 @@ def _joined(parts: Sequence[dict[str, NDArray[Any]]], rows: int) -> dict[str, ND
 def _errors(measures: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     return {
         "first_action_success": float(measures[SUCCESS].mean()),
-        "collision_rate": float(measures["collision"].mean()),
+        "first_action_collision_rate": float(measures[COLLISION].mean()),
         "position_error_m": {
             **_median_and_p95(measures[POSITION_ERROR]),
             **{axis: float(np.median(measures[f"position_error_{axis}_m"])) for axis in "xyz"},
