@@ -1,4 +1,4 @@
-"""Draws README's picture: `python -m benchmarks.scene docs/images/scene.png`."""
+"""Draws the picture of docs/grasp.md: `python -m benchmarks.scene docs/images/scene.png`."""
 
 from __future__ import annotations
 

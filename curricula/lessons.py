@@ -8,7 +8,7 @@ The paper's 19 lessons, in the compact form, where every number goes from a firs
       count: 19
       thresholds: {first: -0.1, last: 0.8}
       parameters:
-        goal_x_m: {first: 0.1, last: 0.01, interpolation: exponential}
+        lateral_limit_m: {first: 0.1, last: 0.01, interpolation: exponential}
 
 The same one by one, where parameters may be samplers and lessons may have names::
 
@@ -16,8 +16,8 @@ The same one by one, where parameters may be samplers and lessons may have names
       type: lessons
       measure: reward
       lessons:
-        - {name: wide, threshold: -0.1, parameters: {goal_x_m: 0.1}}
-        - {name: narrow, parameters: {goal_x_m: 0.01}}
+        - {name: wide, threshold: -0.1, parameters: {lateral_limit_m: 0.1}}
+        - {name: narrow, parameters: {lateral_limit_m: 0.01}}
 """
 
 from collections import deque

@@ -2,10 +2,12 @@
 
 A parameter is a plain number (a constant) or a sampler, drawn anew at every reset::
 
-    block_yaw_deg: {sampler_type: uniform, sampler_parameters: {min_value: -30, max_value: 30}}
     noise_sigma_m: {sampler_type: gaussian, sampler_parameters: {mean: 0.002, st_dev: 0.0005}}
-    camera_x_m: {sampler_type: multirangeuniform, sampler_parameters: {intervals: [[0, 1], [2, 3]]}}
-    goal_yaw_deg: 10
+    yaw_limit_deg: {sampler_type: uniform, sampler_parameters: {min_value: 2, max_value: 10}}
+    block_yaw_limit_deg:
+      sampler_type: multirangeuniform
+      sampler_parameters: {intervals: [[5, 10], [20, 30]]}
+    lateral_limit_m: 0.01
 """
 
 import math

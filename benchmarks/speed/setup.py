@@ -63,5 +63,5 @@ class Setup:
 
     @property
     def rewards(self) -> dict[str, float]:
-        """Weights of the rewards, the main job's."""
+        """Weights of the rewards, the paper's."""
         return DEFAULT_REWARDS
