@@ -161,7 +161,7 @@ class ReplayBuffer:
             unknown = following // self._num_envs == self._row
             goes_on = ~(self._done[last] | unknown)
             last = np.where(goes_on, following, last)
-            total = total + goes_on * gamma**power * self._rewards[following]
+            total[goes_on] += gamma**power * self._rewards[following[goes_on]]
             discount[goes_on] *= gamma
         discount[self._terminated[last]] = 0.0
         return self._to_device(total), self._to_device(discount), last

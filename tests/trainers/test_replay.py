@@ -155,6 +155,7 @@ def check(buffer: ReplayBuffer, world: World, gamma: float, steps: int) -> None:
     after = as_seen(buffer.next_observations(places, NAMES))
     rewards = buffer.rewards(places).tolist()
     totals, discounts, last = buffer.returns(places, gamma, steps)
+    assert totals.dtype == discounts.dtype == torch.float32
     led_to = as_seen(buffer.next_observations(last, NAMES))
     for i, action in enumerate(actions):
         history, number = expected[action]
