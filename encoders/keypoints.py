@@ -32,8 +32,8 @@ class Keypoints(nn.Module):
     The image is looked at in overlapping patches. Each is described by its shape, which is its
     depths relative to that of its middle, clipped so that an edge is an edge however far the
     background, and by where its middle is: the 3-D point that the camera's intrinsics give. What
-    lies beyond the camera's range is no point and gets no attention. Each of K attention maps (a
-    softmax over all patches, as in spatial soft-argmax: Levine et al. 2016, arXiv:1504.00702)
+    lies farther than the camera's range is no point and gets no attention. Each of K attention maps
+    (a softmax over all patches, as in spatial soft-argmax: Levine et al. 2016, arXiv:1504.00702)
     yields the mean of the points it attends to, their covariance (which tells the orientation of
     the surface), and the mean of some learned features.
 

@@ -158,7 +158,11 @@ class DDPG:
 
     @torch.no_grad()
     def act(self, observations: Observations, *, deterministic: bool) -> tuple[Tensor, Tensor]:
-        """See `Algorithm.act`; what is drawn has the noise of the run's end."""
+        """See `Algorithm.act`; what is drawn has the noise of the run's end.
+
+        No action is replaced by one of `random_actions`: those are drawn for the buffer's sake and
+        say nothing of the policy.
+        """
         actions = self.policy.online.act(observations)
         if not deterministic:
             sigma = self._sigma(1.0) * self._hyperparameters.noise.deviation()

@@ -50,7 +50,8 @@ def evaluate(
 
     Where the first action is to be right, as in grasping, it is judged by itself, and the whole
     episodes are played as at the end of training: with actions that are drawn, or bear what
-    exploration noise was left. Elsewhere they are played by the deterministic policy.
+    exploration noise was left (DDPG's `random_actions` are left out). Elsewhere they are played by
+    the deterministic policy.
 
     Args:
         policy: a run's folder or id, or a checkpoint's folder.
@@ -180,7 +181,7 @@ class _Player:
 def _whole_episodes(player: _Player, episodes: int, *, deterministic: bool) -> dict[str, Any]:
     """Plays until every environment has ended its share of episodes.
 
-    Shares, because the first episodes to end would be the short ones, which are the good ones.
+    Shares, because the first episodes to end would be the short ones, not like the others.
     """
     interaction = player.interaction
     count = interaction.env.num_envs

@@ -361,7 +361,8 @@ def test_noise_falls_along_its_schedule(make_ddpg: MakeDDPG) -> None:
 
 
 def test_evaluation_draws_with_noise_only_where_it_is_asked_to(make_ddpg: MakeDDPG) -> None:
-    algorithm = make_ddpg("target", {"noise": {"type": "gaussian", "sigma": 0.2}})
+    noise = {"type": "gaussian", "sigma": 0.2}
+    algorithm = make_ddpg("target", {"noise": noise, "random_actions": 0.5})
     observations = Observations({}, {"goal": torch.zeros(5_000, 2)})
     best, _ = algorithm.act(observations, deterministic=True)
     assert torch.equal(best, algorithm.act(observations, deterministic=True)[0])
