@@ -69,12 +69,12 @@ class Facing:
 class Precision:
     """Pays exactness: -gain * sum_i log(1 + (e_i / s_i)^2) / 2 over four errors e_i.
 
-    The errors are those sideways, up, in the gap (to `gap_m`) and in yaw. Well over its
-    scale s_i an error costs its logarithm: halving it pays the same whether it is large or small,
-    so that the gradient does not fade as a policy becomes exact, and one hopeless scene does not
-    outweigh the others. It is also why exploration settles at about the size of the errors: seen
-    from further away than its own width the logarithm is convex (wider noise pays), nearer it is
-    concave (narrower noise does).
+    The errors are those sideways, up, in the gap (to `gap_m`) and in yaw. Well over its scale s_i
+    an error costs its logarithm: halving it pays the same whether it is large or small, so that the
+    gradient does not fade as a policy becomes exact, and one hopeless scene does not outweigh the
+    others. It is also why exploration settles at about the size of the errors: seen from further
+    away than its own width the logarithm is convex (wider noise pays), nearer it is concave
+    (narrower noise does).
     """
 
     class Settings(BaseModel, frozen=True, extra="forbid"):

@@ -42,7 +42,7 @@ class Algorithm(Protocol):
 
         Args:
             observations: B observations, with what is remembered before them.
-            deterministic: the policy's best action, or one drawn as in training.
+            deterministic: the policy's best action, or one drawn as at the end of training.
 
         Returns:
             Actions (B, ...), and what is to be remembered of each, (B, m).

@@ -50,8 +50,7 @@ def evaluate(
 
     Where the first action is to be right, as in grasping, it is judged by itself, and the whole
     episodes are played as at the end of training: with actions that are drawn, or bear what
-    exploration noise was left (DDPG's `random_actions` are left out). Elsewhere they are played by
-    the deterministic policy.
+    exploration noise was left. Elsewhere they are played by the deterministic policy.
 
     Args:
         policy: a run's folder or id, or a checkpoint's folder.
@@ -195,10 +194,10 @@ def _whole_episodes(player: _Player, episodes: int, *, deterministic: bool) -> d
         parts.append(finished[ended[done] < share[done]])
         ended[done] += 1
     played = concatenate(parts)
-    means = {name: float(values.mean()) for name, values in played.measures.items()}
-    rates = (("success", SUCCESS), ("collision_rate", COLLISION))
+    shares = _means(played.measures)
+    rates = {"success": SUCCESS, "collision_rate": COLLISION}
     return {
-        **{key: means[name] for key, name in rates if name in means},
+        **{key: shares[name] for key, name in rates.items() if name in shares},
         "reward": float(played.rewards.mean()),
         "reward_std": float(played.rewards.std()),
         "episode_length": float(played.lengths.mean()),
@@ -246,8 +245,12 @@ def _errors(measures: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 def _picks(outcomes: Mapping[str, NDArray[np.bool_]]) -> dict[str, Any]:
     if not outcomes:
         return {}
-    rates = {name: float(rows.mean()) for name, rows in outcomes.items()}
+    rates = _means(outcomes)
     return {"pick_rate": rates.pop(SUCCESS), "pick_failures": rates}
+
+
+def _means(columns: Mapping[str, NDArray[Any]]) -> dict[str, float]:
+    return {name: float(values.mean()) for name, values in columns.items()}
 
 
 def _median_and_p95(values: NDArray[np.float64]) -> dict[str, float]:
