@@ -29,19 +29,19 @@ from torch.nn import functional as F
 from envs.grasp.scene import heading
 from envs.grasp.task import goal_middle_m
 from envs.grasp.vector_env import GraspVectorEnv
-from trainers.ddpg import DDPGSettings
-from trainers.deterministic import DeterministicActorCritic
-from trainers.errors import UserError
+from trainers.algorithms.ddpg import DDPGSettings
+from trainers.algorithms.ppo import PPOSettings
+from trainers.algorithms.trpo import TRPOSettings
+from trainers.common.errors import UserError
 from trainers.evaluation import FIRST_SEED, final_parameters
 from trainers.learn import DONE, MISTAKE
-from trainers.networks import NetworkFactory
-from trainers.observations import to_tensors
-from trainers.plugins import load_registries
-from trainers.policy import ActorCritic, to_environment
-from trainers.ppo import PPOSettings
+from trainers.networks.actor_critic import ActorCritic, to_environment
+from trainers.networks.deterministic import DeterministicActorCritic
+from trainers.networks.network import NetworkFactory
+from trainers.networks.observations import to_tensors
+from trainers.runfile.registry import load_registries
+from trainers.runfile.settings import RunSettings, load_run
 from trainers.session import build_environment, build_factory
-from trainers.settings import RunSettings, load_run
-from trainers.trpo import TRPOSettings
 
 Policy = ActorCritic | DeterministicActorCritic
 

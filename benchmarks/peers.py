@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from envs.environment import Environment
-from trainers.observations import is_frame
-from trainers.timers import timed
+from trainers.common.timers import timed
+from trainers.networks.observations import is_frame
 
 Indices = int | Iterable[int] | None
 Arrays = NDArray[Any] | dict[str, NDArray[Any]]

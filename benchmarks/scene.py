@@ -10,7 +10,7 @@ import numpy as np
 
 from envs.grasp.env import make_vector_env
 from envs.grasp.scene import heading
-from trainers.pictures import picture
+from trainers.reporting.images import picture
 
 SEED = 3
 GAP_M = 0.015

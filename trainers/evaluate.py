@@ -12,9 +12,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from trainers.errors import UserError
+from trainers.common.errors import UserError
+from trainers.common.files import write_atomically
 from trainers.evaluation import evaluate
-from trainers.files import write_atomically
 from trainers.learn import DONE, MISTAKE
 
 UNITS = {

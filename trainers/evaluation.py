@@ -16,18 +16,18 @@ from torch import nn
 
 from curricula.samplers import ParameterValue
 from envs.environment import Album, Environment, PhysicalCheck
-from trainers.algorithm import Algorithm
-from trainers.checkpoint import Loaded
-from trainers.errors import UserError
-from trainers.gallery import EVALUATION, Gallery
-from trainers.interaction import SUCCESS, Episodes, Interaction, Step, concatenate
-from trainers.memory import Sequences
-from trainers.observations import to_tensors
-from trainers.plugins import Registries, load_registries
-from trainers.policy import to_environment
-from trainers.results import CONFIGURATION, find_checkpoint, run_folder
+from trainers.algorithms.base import Algorithm
+from trainers.common.errors import UserError
+from trainers.experience.env_runner import SUCCESS, Episodes, Interaction, Step, concatenate
+from trainers.networks.actor_critic import to_environment
+from trainers.networks.observations import to_tensors
+from trainers.networks.recurrent import Sequences
+from trainers.runfile.registry import Registries, load_registries
+from trainers.runfile.settings import RunSettings, load_run
+from trainers.saving.checkpoint import Loaded
+from trainers.saving.evaluation_folder import EVALUATION, Gallery
+from trainers.saving.run_folder import CONFIGURATION, find_checkpoint, run_folder
 from trainers.session import build_curriculum, build_environment, build_factory
-from trainers.settings import RunSettings, load_run
 
 # Run files take seeds below this, so that no run was ever trained on an evaluation's scenes.
 FIRST_SEED = 2**32

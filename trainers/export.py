@@ -7,11 +7,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from trainers.checkpoint import MANIFEST, WEIGHTS, weights_manifest
-from trainers.errors import UserError
-from trainers.files import write_atomically
+from trainers.common.errors import UserError
+from trainers.common.files import write_atomically
 from trainers.learn import DONE, MISTAKE
-from trainers.results import CHECKPOINTS, CONFIGURATION, find_checkpoint, run_folder
+from trainers.saving.checkpoint import MANIFEST, WEIGHTS, weights_manifest
+from trainers.saving.run_folder import CHECKPOINTS, CONFIGURATION, find_checkpoint, run_folder
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -60,6 +60,6 @@ def ventosa_environments() -> dict[str, type]:  # type: ignore[empty-body]
 def ventosa_trainers() -> dict[str, type]:  # type: ignore[empty-body]
     """Offer trainers (algorithms): name -> class; the run file's `trainer_type` names it.
 
-    It follows `trainers.algorithm.Algorithm`, and its settings extend
-    `trainers.algorithm.TrainerSettings`.
+    It follows `trainers.algorithms.base.Algorithm`, and its settings extend
+    `trainers.algorithms.base.TrainerSettings`.
     """

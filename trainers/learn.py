@@ -26,8 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Imported late, so that `--help` and a mistyped option answer at once.
     from envs.environment import EnvironmentFailure  # noqa: PLC0415
-    from trainers.errors import UserError  # noqa: PLC0415
-    from trainers.interaction import NonFiniteError  # noqa: PLC0415
+    from trainers.common.errors import UserError  # noqa: PLC0415
+    from trainers.experience.env_runner import NonFiniteError  # noqa: PLC0415
     from trainers.run import run_file  # noqa: PLC0415
 
     with stop_on_signals() as stop:

@@ -1,9 +1,9 @@
 """The algorithms that ventosa brings along."""
 
-from trainers.ddpg import DDPG
+from trainers.algorithms.ddpg import DDPG
+from trainers.algorithms.ppo import PPO
+from trainers.algorithms.trpo import TRPO
 from trainers.hookspecs import hookimpl
-from trainers.ppo import PPO
-from trainers.trpo import TRPO
 
 
 @hookimpl

@@ -8,19 +8,19 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from trainers.algorithm import TrainerSettings
-from trainers.checkpoint import Checkpoints, Loaded
-from trainers.errors import UserError
-from trainers.files import write_atomically
-from trainers.interaction import NonFiniteError
-from trainers.metrics import RunLog
-from trainers.plugins import load_registries
-from trainers.progress import Progress, make_progress
-from trainers.results import CHECKPOINTS, begin, check, find_checkpoint
+from trainers.algorithms.base import TrainerSettings
+from trainers.common.errors import UserError
+from trainers.common.files import write_atomically
+from trainers.common.timers import Timer, recording
+from trainers.experience.env_runner import NonFiniteError
+from trainers.reporting.event_log import RunLog
+from trainers.reporting.summary import Summary
+from trainers.reporting.terminal import Progress, make_progress
+from trainers.runfile.registry import load_registries
+from trainers.runfile.settings import dump_yaml, load_run
+from trainers.saving.checkpoint import Checkpoints, Loaded
+from trainers.saving.run_folder import CHECKPOINTS, begin, check, find_checkpoint
 from trainers.session import Session
-from trainers.settings import dump_yaml, load_run
-from trainers.summary import Summary
-from trainers.timers import Timer, recording
 from trainers.training import train
 
 TIMERS = "timers.json"

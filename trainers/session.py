@@ -13,18 +13,18 @@ from curricula.curriculum import Curriculum, FinishedEpisodes, State
 from curricula.samplers import ParameterValue
 from envs.environment import Environment
 from rewards.reward import RewardTerm
-from trainers.algorithm import Algorithm
-from trainers.errors import UserError
-from trainers.interaction import Episodes, Interaction
-from trainers.networks import (
+from trainers.algorithms.base import Algorithm
+from trainers.common.errors import UserError
+from trainers.experience.env_runner import Episodes, Interaction
+from trainers.networks.network import (
     DEFAULT_IMAGE_ENCODER,
     DEFAULT_VECTOR_ENCODER,
     NetworkFactory,
     NetworkSettings,
 )
-from trainers.observations import is_frame
-from trainers.plugins import Registries, suggestion
-from trainers.settings import Component, RunSettings
+from trainers.networks.observations import is_frame
+from trainers.runfile.registry import Registries, suggestion
+from trainers.runfile.settings import Component, RunSettings
 
 
 class Session:

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from envs.environment import EnvironmentFailure
-from trainers.algorithm import TrainerSettings
-from trainers.checkpoint import Checkpoints
-from trainers.interaction import StopRequested
-from trainers.progress import Progress
+from trainers.algorithms.base import TrainerSettings
+from trainers.common.timers import timed
+from trainers.experience.env_runner import StopRequested
+from trainers.reporting.summary import Summary
+from trainers.reporting.terminal import Progress
+from trainers.saving.checkpoint import Checkpoints
 from trainers.session import Session
-from trainers.summary import Summary
-from trainers.timers import timed
 
 
 def train(

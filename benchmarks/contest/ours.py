@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.contest.evaluation import Act, Referee
-from trainers.observations import to_tensors
-from trainers.plugins import Registries
-from trainers.policy import to_environment
+from trainers.networks.actor_critic import to_environment
+from trainers.networks.observations import to_tensors
+from trainers.runfile.registry import Registries
+from trainers.runfile.settings import RunSettings
 from trainers.session import Session
-from trainers.settings import RunSettings
 
 
 def learn(run: RunSettings, registries: Registries, referee: Referee) -> Act:

@@ -11,10 +11,10 @@ from pathlib import Path
 from benchmarks.contest import ours, theirs
 from benchmarks.contest.cases import OURS, PEER, SIDES, Case, Entry
 from benchmarks.contest.evaluation import Referee, returns
-from trainers.files import write_atomically
-from trainers.plugins import load_registries
+from trainers.common.files import write_atomically
+from trainers.runfile.registry import load_registries
+from trainers.runfile.settings import load_run
 from trainers.session import build_environment
-from trainers.settings import load_run
 
 EVALUATION_ENVS = 10
 EVALUATIONS = 20

@@ -19,15 +19,15 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from benchmarks.contest.evaluation import Act, Referee
 from benchmarks.peers import PeerVecEnv
-from trainers.ddpg import DDPGSettings
-from trainers.networks import ACTIVATIONS, NetworkSettings
-from trainers.plugins import Registries
-from trainers.policy import PolicySettings
-from trainers.ppo import PPOSettings
-from trainers.schedules import Schedule
+from trainers.algorithms.ddpg import DDPGSettings
+from trainers.algorithms.ppo import PPOSettings
+from trainers.algorithms.schedules import Schedule
+from trainers.algorithms.trpo import TRPOSettings
+from trainers.networks.actor_critic import PolicySettings
+from trainers.networks.network import ACTIVATIONS, NetworkSettings
+from trainers.runfile.registry import Registries
+from trainers.runfile.settings import RunSettings
 from trainers.session import build_environment
-from trainers.settings import RunSettings
-from trainers.trpo import TRPOSettings
 
 
 def learn(run: RunSettings, registries: Registries, referee: Referee) -> Act:

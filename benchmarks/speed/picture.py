@@ -11,7 +11,7 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from benchmarks.speed.figures import FAST, OURS, PEER, PYBULLET, Figure
-from trainers.progress import format_count
+from trainers.reporting.terminal import format_count
 
 COLORS = {OURS: "#0b6e4f", FAST: "#0b6e4f", PEER: "#c8553d", PYBULLET: "#c8553d"}
 LEFT_OUT = ("collection steps", "update steps")

@@ -14,7 +14,7 @@ from benchmarks.speed.setup import CAMERA, Setup
 from encoders.conv import Paper
 from encoders.layers import dense
 from envs.grasp.env import make_vector_env
-from trainers.timers import timed
+from trainers.common.timers import timed
 
 
 class StableBaselines:

@@ -15,7 +15,7 @@ from benchmarks.speed.figures import MODES, OURS, PEER, Case, Figure
 from benchmarks.speed.setup import Setup
 from benchmarks.speed.timing import Samples, interleave
 from benchmarks.speed.ventosa import Ventosa
-from trainers.timers import Timer, recording
+from trainers.common.timers import Timer, recording
 
 WHATS = {
     "collection steps": "collect",

@@ -14,16 +14,16 @@ from encoders.conv import Paper
 from envs.grasp.settings import GraspSettings
 from envs.grasp.vector_env import GraspVectorEnv
 from rewards.plugin import ventosa_rewards
-from trainers.checkpoint import Checkpoints
-from trainers.metrics import RunLog
-from trainers.plugins import load_registries
-from trainers.policy import PolicySettings
-from trainers.ppo import PPO, PPOHyperparameters, PPOSettings
-from trainers.progress import make_progress
-from trainers.schedules import Schedule
+from trainers.algorithms.ppo import PPO, PPOHyperparameters, PPOSettings
+from trainers.algorithms.schedules import Schedule
+from trainers.networks.actor_critic import PolicySettings
+from trainers.reporting.event_log import RunLog
+from trainers.reporting.summary import Summary
+from trainers.reporting.terminal import make_progress
+from trainers.runfile.registry import load_registries
+from trainers.runfile.settings import Component, RunSettings, WeightedReward
+from trainers.saving.checkpoint import Checkpoints
 from trainers.session import Session
-from trainers.settings import Component, RunSettings, WeightedReward
-from trainers.summary import Summary
 from trainers.training import train
 
 CONSTANT = Schedule(type="constant")

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from benchmarks import ablation
-from trainers.plugins import load_registries
-from trainers.settings import load_run
+from trainers.runfile.registry import load_registries
+from trainers.runfile.settings import load_run
 
 
 @pytest.mark.parametrize("change", ablation.CHANGES[1:], ids=lambda change: change.slug)

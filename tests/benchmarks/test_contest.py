@@ -130,9 +130,9 @@ def test_the_peers_side_learns(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3")
     pytest.importorskip("sb3_contrib")
     from benchmarks.contest.theirs import learn
-    from trainers.plugins import load_registries
+    from trainers.runfile.registry import load_registries
+    from trainers.runfile.settings import load_run
     from trainers.session import build_environment
-    from trainers.settings import load_run
 
     registries = load_registries()
     case = Case("ppo", "cartpole", 1)

@@ -12,9 +12,9 @@ import torch
 from benchmarks import fit
 from envs.grasp.settings import GraspSettings
 from envs.grasp.vector_env import GraspVectorEnv
-from trainers.plugins import load_registries
+from trainers.runfile.registry import load_registries
+from trainers.runfile.settings import load_run
 from trainers.session import build_factory
-from trainers.settings import load_run
 
 RUN_FILE = Path(__file__).parents[2] / "config" / "run.yaml"
 

@@ -20,8 +20,8 @@ from benchmarks.peers import PeerVecEnv
 from benchmarks.speed.setup import Setup
 from benchmarks.speed.stable_baselines import StableBaselines
 from benchmarks.speed.ventosa import Ventosa
-from trainers.observations import Observations
-from trainers.policy import ActorCritic
+from trainers.networks.actor_critic import ActorCritic
+from trainers.networks.observations import Observations
 
 HEIGHT, WIDTH = 5, 7
 

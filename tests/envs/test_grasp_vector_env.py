@@ -22,7 +22,7 @@ from envs.grasp.simulators.pybullet import PyBulletSimulator
 from envs.grasp.vector_env import GraspVectorEnv
 from rewards.plugin import ventosa_rewards
 from rewards.reward import RewardTerm
-from trainers.serialization import flatten, unflatten
+from trainers.saving.serialization import flatten, unflatten
 
 SHAPED = ("touch", "collision", "position", "rotation", "approach", "facing")
 SMALL = {"depth": Camera(type="depth", width=32, height=24)}

@@ -11,10 +11,10 @@ import pytest
 
 from envs.grasp.album import GraspAlbum
 from trainers import evaluation
-from trainers.errors import UserError
+from trainers.common.errors import UserError
 from trainers.evaluate import main
-from trainers.gallery import REPORT, Gallery
-from trainers.plugins import Registries
+from trainers.runfile.registry import Registries
+from trainers.saving.evaluation_folder import REPORT, Gallery
 
 GRASP: dict[str, Any] = {
     "type": "grasp",

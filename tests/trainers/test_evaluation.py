@@ -14,14 +14,14 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
-from trainers.checkpoint import Checkpoints
+from trainers.algorithms.ppo import PPO
 from trainers.evaluate import main
-from trainers.observations import Observations
-from trainers.plugins import Registries
-from trainers.ppo import PPO
-from trainers.results import begin
+from trainers.networks.observations import Observations
+from trainers.runfile.registry import Registries
+from trainers.runfile.settings import RunSettings
+from trainers.saving.checkpoint import Checkpoints
+from trainers.saving.run_folder import begin
 from trainers.session import Session
-from trainers.settings import RunSettings
 
 LENGTHS = (2, 4)
 GYMNASIUM = {"type": "gymnasium", "id": "ventosa_tests/Square-v0", "num_envs": 2}

@@ -12,7 +12,7 @@ from trainers import evaluation
 from trainers.evaluation import evaluate
 from trainers.export import main
 from trainers.learn import DONE, MISTAKE
-from trainers.plugins import Registries
+from trainers.runfile.registry import Registries
 
 
 @pytest.fixture

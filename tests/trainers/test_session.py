@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from curricula.samplers import UniformSampler
-from trainers.errors import UserError
-from trainers.interaction import Episodes
-from trainers.plugins import Registries
+from trainers.common.errors import UserError
+from trainers.experience.env_runner import Episodes
+from trainers.runfile.registry import Registries
+from trainers.runfile.settings import RunSettings
 from trainers.session import Session, resolve_device
-from trainers.settings import RunSettings
 
 MakeRun = Callable[..., RunSettings]
 MakeSession = Callable[..., Session]

@@ -12,12 +12,12 @@ import pytest
 import torch
 
 from envs.environment import EnvironmentFailure
-from trainers.checkpoint import Checkpoints, Loaded
-from trainers.interaction import NonFiniteError
-from trainers.plugins import Registries
+from trainers.experience.env_runner import NonFiniteError
+from trainers.reporting.summary import Summary
+from trainers.runfile.registry import Registries
+from trainers.runfile.settings import RunSettings
+from trainers.saving.checkpoint import Checkpoints, Loaded
 from trainers.session import Session
-from trainers.settings import RunSettings
-from trainers.summary import Summary
 from trainers.training import train
 
 MakeRun = Callable[..., RunSettings]

@@ -1,0 +1,116 @@
+"""Whole runs in gymnasium's environments: learned, stopped and gone on with, refused."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs.gym.vector_env import GymEnvironment
+from trainers.algorithms.ppo import PPO
+from trainers.experience.env_runner import StopRequested
+from trainers.saving.checkpoint import Checkpoints, Loaded
+from trainers.session import Session
+
+Learn = Callable[..., Any]
+WriteRun = Callable[..., Path]
+PENDULUM = {"type": "gymnasium", "id": "Pendulum-v1", "num_envs": 2, "max_episode_steps": 25}
+NORMALIZED = {
+    "max_steps": 384,
+    "hyperparameters": {
+        "buffer_size": 64,
+        "batch_size": 32,
+        "normalize_rewards": True,
+        "learning_rate_schedule": "constant",
+        "beta_schedule": "constant",
+    },
+    "network_settings": {"normalize": True},
+}
+
+
+def latest(results: Path, run_id: str) -> Loaded:
+    return Checkpoints(results / run_id / "checkpoints", keep=9).load_latest()
+
+
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+def test_a_run_taken_up_again_ends_exactly_as_one_that_was_not_stopped(
+    learn: Learn, write_run: WriteRun, monkeypatch: pytest.MonkeyPatch, vectorization: str
+) -> None:
+    config = write_run({**PENDULUM, "vectorization": vectorization}, NORMALIZED)
+    assert learn(config, "--run-id", "whole").code == 0
+    with monkeypatch.context() as patch:
+        stop_in_step(patch, 100)  # in the middle of an episode and of a collection
+        assert learn(config, "--run-id", "halves").results.is_dir()
+    results = learn(config, "--run-id", "halves", "--resume").results
+    whole, halves = latest(results, "whole"), latest(results, "halves")
+    assert whole.step == halves.step == 384
+    for name in ("weights.safetensors", "state.safetensors", "state.json"):
+        assert (halves.path / name).read_bytes() == (whole.path / name).read_bytes(), name
+
+
+def stop_in_step(patch: pytest.MonkeyPatch, number: int) -> None:
+    count = 0
+    step = GymEnvironment.step
+
+    def counted(self: GymEnvironment, actions: Any) -> Any:
+        nonlocal count
+        count += 1
+        if count == number:
+            raise StopRequested
+        return step(self, actions)
+
+    patch.setattr(GymEnvironment, "step", counted)
+
+
+def test_what_is_reported_are_the_environments_own_rewards(
+    make_session: Callable[..., Session],
+) -> None:
+    session = make_session(PENDULUM, NORMALIZED)
+    session.algorithm.collect()
+    session.algorithm.update(0.0)
+    returns = session.interaction.take_finished().rewards
+    assert len(returns) == 2
+    assert np.all(returns < -20)  # swinging about at random costs some 5 a step
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"environment": {"id": "Pendulm-v1"}}, r"environment \(gymnasium\): id: .*'Pendulum-v1'"),
+        ({"environment": {"kwargs": {"gg": 1.0}}}, r"environment \(gymnasium\): .*argument 'gg'"),
+        ({"environment": {"ids": "x"}}, "environment.ids: unknown key; did you mean 'id'"),
+        ({"rewards": [{"type": "touch"}]}, r"environment \(gymnasium\): .*\(touch\) don't apply"),
+        (
+            {"environment_parameters": {"gravity": 1.0}},
+            "environment_parameters: the environment has no parameter 'gravity'",
+        ),
+    ],
+)
+def test_mistakes_are_told_before_anything_starts(
+    learn: Learn, write_run: WriteRun, change: dict[str, Any], message: str
+) -> None:
+    environment = {**PENDULUM, **change.pop("environment", {})}
+    told = learn(write_run(environment, **change))
+    assert told.code == 2
+    assert not told.results.exists()
+    assert re.search(message, told.errors)
+
+
+def test_it_learns_to_balance_a_pole(make_session: Callable[..., Session]) -> None:
+    cart_pole = {"type": "gymnasium", "id": "CartPole-v1", "num_envs": 8}
+    hyper = {"buffer_size": 256, "batch_size": 256, "num_epoch": 20, "learning_rate": 1e-3}
+    hyper |= {"gamma": 0.98, "lambd": 0.8, "beta": 0.0}
+    network = {"hidden_units": 64, "num_layers": 2, "activation": "tanh", "critic": "separate"}
+    trainer = {"hyperparameters": hyper, "network_settings": network}
+    algorithm = make_session(cart_pole, trainer).algorithm
+    assert isinstance(algorithm, PPO)
+    for _ in range(40):
+        algorithm.collect()
+        algorithm.update(0.0)
+    lengths = algorithm._interaction.take_finished().lengths
+    assert lengths[:20].mean() < 40
+    assert lengths[-10:].mean() > 80

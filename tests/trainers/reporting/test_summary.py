@@ -1,0 +1,208 @@
+"""What a run reports, and when."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trainers.experience.env_runner import Episodes
+from trainers.reporting.summary import Summary, measure_tag
+from trainers.reporting.terminal import ProgressLine
+from trainers.session import Session
+
+MakeSession = Callable[..., Session]
+
+
+class Log:
+    """Keeps what a `RunLog` would write."""
+
+    def __init__(self) -> None:
+        self.points: dict[int, dict[str, float]] = {}
+        self.pictures: list[tuple[str, tuple[int, ...], int]] = []
+        self.statuses: list[dict[str, Any]] = []
+
+    def scalars(self, values: dict[str, float], step: int) -> None:
+        self.points[step] = dict(values)
+
+    def images(self, tag: str, image: np.ndarray, step: int) -> None:
+        self.pictures.append((tag, image.shape, step))
+
+    def status(self, values: dict[str, Any]) -> None:
+        self.statuses.append(values)
+
+
+class Display:
+    def __init__(self) -> None:
+        self.lines: list[ProgressLine] = []
+
+    def update(self, line: ProgressLine) -> None:
+        self.lines.append(line)
+
+
+def summary_of(log: Log, start_step: int = 0, summary_freq: int = 100) -> Summary:
+    return Summary(log, "run", 1000, summary_freq, start_step)  # type: ignore[arg-type]
+
+
+def report(summary: Summary, session: Session, step: int) -> Display:
+    display = Display()
+    session.interaction.step_count = step
+    summary.report(session, display)  # type: ignore[arg-type]
+    return display
+
+
+def episodes(rewards: list[float], **measures: list[float]) -> Episodes:
+    values = np.array(rewards)
+    arrays = {name: np.array(numbers) for name, numbers in measures.items()}
+    return Episodes(values, 10 * values, {"near": values / 2, "far": values / 4}, arrays)
+
+
+def test_episodes_weigh_alike_however_they_arrive(make_session: MakeSession) -> None:
+    log, session = Log(), make_session()
+    summary = summary_of(log)
+    summary.add_episodes(episodes([1.0, 1.0, 1.0], success=[0, 0, 1], error_m=[1, 1, 1]))
+    summary.add_episodes(episodes([], success=[], error_m=[]))
+    summary.add_episodes(episodes([5.0], success=[1], error_m=[9]))
+    summary.add({"Losses/Policy Loss": 1.0})
+    summary.add({"Losses/Policy Loss": 2.0})
+    report(summary, session, 100)
+    points = log.points[100]
+    assert points.pop("Performance/Steps Per Second") > 0
+    assert points == {
+        "Environment/Cumulative Reward": 2.0,
+        "Environment/Episode Length": 20.0,
+        "Environment/Success Rate": 0.5,
+        "Environment/Error M": 3.0,
+        "Reward/near": 1.0,
+        "Reward/far": 0.5,
+        "Losses/Policy Loss": 1.5,
+    }
+
+
+def test_measures_have_the_names_people_look_for() -> None:
+    assert measure_tag("success") == "Environment/Success Rate"
+    assert measure_tag("collision") == "Environment/Collision Rate"
+    assert measure_tag("position_error_m") == "Environment/Position Error M"
+
+
+def test_summaries_come_at_multiples_of_their_frequency(make_session: MakeSession) -> None:
+    log, session = Log(), make_session()
+    summary = summary_of(log)
+    for step in range(32, 480, 32):
+        report(summary, session, step)
+    # The first update at once, and then the first step at or after 100, 200, 300 and 400.
+    assert list(log.points) == [32, 128, 224, 320, 416]
+    resumed = summary_of(log2 := Log(), start_step=320)
+    for step in range(352, 480, 32):
+        report(resumed, session, step)
+    assert list(log2.points) == [352, 416]
+
+
+def test_a_summary_starts_anew_and_the_status_remembers(make_session: MakeSession) -> None:
+    log, session = Log(), make_session()
+    summary = summary_of(log)
+    summary.add_episodes(episodes([1.0, 3.0], success=[0, 1]))
+    report(summary, session, 100)
+    display = report(summary, session, 200)  # no episode has ended in between
+    assert "Environment/Cumulative Reward" not in log.points[200]
+    assert display.lines[0].reward == 2.0
+    assert display.lines[0].success == 0.5
+    assert log.statuses[-1]["reward"] == 2.0
+    summary.add_episodes(episodes([7.0], success=[1]))
+    report(summary, session, 300)
+    assert log.statuses[-1]["reward"] == 7.0
+
+
+def test_the_status_says_where_the_run_stands(make_session: MakeSession) -> None:
+    log, session = Log(), make_session()
+    summary = summary_of(log)
+    summary.status(session, "running")
+    before = log.statuses[-1]
+    assert before.pop("elapsed_s") >= 0
+    assert before == {
+        "run_id": "run",
+        "state": "running",
+        "step": 0,
+        "max_steps": 1000,
+        "lesson": 1,
+        "lessons": 1,
+        "reward": None,
+        "success": None,
+        "steps_per_second": None,
+        "last_checkpoint": None,
+    }
+    summary.note_checkpoint(Path("/somewhere/step-9"))
+    session.interaction.step_count = 64
+    summary.status(session, "finished")
+    assert log.statuses[-1]["state"] == "finished"
+    assert log.statuses[-1]["step"] == 64
+    assert log.statuses[-1]["last_checkpoint"] == "/somewhere/step-9"
+
+
+LESSONS = {
+    "type": "lessons",
+    "measure": "reward",
+    "smoothing_episodes": 1,
+    "min_lesson_length": 1,
+    "lessons": [{"threshold": -9.0, "parameters": {"scale": 2.0}}, {"parameters": {"scale": 1.0}}],
+}
+
+
+def test_the_score_counts_lessons_before_success_and_rewards_where_there_is_neither(
+    make_session: MakeSession,
+) -> None:
+    log, session = Log(), make_session("target", curriculum=LESSONS)
+    summary = summary_of(log)
+    assert summary.score is None
+    summary.add_episodes(episodes([1.0, 2.0], success=[1, 0]))
+    report(summary, session, 100)
+    assert summary.score == 0.5
+    assert log.points[100]["Environment/Lesson Number/lesson"] == 1
+    session.advance_curriculum(episodes([1.0]), 0.5)
+    summary.add_episodes(episodes([1.0, 1.0], success=[0, 0]))
+    report(summary, session, 200)
+    assert summary.score == 1.0  # a success rate of 0 in lesson 2 beats any in lesson 1
+    assert log.points[200]["Environment/Lesson Number/lesson"] == 2
+    assert log.statuses[-1]["lesson"] == log.statuses[-1]["lessons"] == 2
+    plain = summary_of(Log())
+    plain.add_episodes(episodes([-3.0]))
+    report(plain, make_session(), 100)
+    assert plain.score == -3.0
+
+
+def test_no_lesson_is_logged_without_a_curriculum(make_session: MakeSession) -> None:
+    log = Log()
+    report(summary_of(log), make_session(), 100)
+    assert not [tag for tag in log.points[100] if "Lesson" in tag]
+
+
+def test_every_tenth_summary_shows_what_the_cameras_see(make_session: MakeSession) -> None:
+    log = Log()
+    camera = {"camera": {"type": "conv", "layers": [[2, 3, 1]]}}
+    session = make_session("picture", encoders=camera)
+    summary = summary_of(log, summary_freq=10)
+    for step in range(10, 220, 10):
+        report(summary, session, step)
+    shown = ("Observations/camera", (240, 240, 3))
+    assert log.pictures == [(*shown, 10), (*shown, 110), (*shown, 210)]
+
+
+def test_time_left_is_that_of_the_steps_that_are_left(
+    make_session: MakeSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [50.0]
+    monkeypatch.setattr("trainers.reporting.summary.time.monotonic", lambda: now[0])
+    log, session = Log(), make_session()
+    summary = summary_of(log, start_step=200)
+    now[0] += 10.0
+    line = report(summary, session, 400).lines[0]
+    assert line.seconds_left == pytest.approx(30.0)  # 600 steps at 20 a second
+    assert line.steps_per_second == pytest.approx(20.0)
+    now[0] += 10.0
+    line = report(summary, session, 800).lines[0]
+    assert line.steps_per_second == pytest.approx(40.0)  # since the last summary
+    assert line.seconds_left == pytest.approx(200 / 30)  # at the mean speed of this process
+    assert log.statuses[-1]["elapsed_s"] == 20.0

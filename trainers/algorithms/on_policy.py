@@ -1,0 +1,131 @@
+"""What algorithms share that learn from the present policy's own experience, as PPO does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from pydantic import BaseModel, Field, model_validator
+from torch import Tensor, nn
+
+from trainers.algorithms.optimization import descend
+from trainers.algorithms.schedules import LINEAR, Schedule
+from trainers.experience.collector import OnPolicyCollector
+from trainers.experience.env_runner import Interaction
+from trainers.experience.reward_normalizer import RewardNormalizer
+from trainers.experience.rollout import Rollout
+from trainers.networks.actor_critic import ActorCritic
+from trainers.networks.observations import Observations
+
+
+class OnPolicyHyperparameters(BaseModel, frozen=True, extra="forbid"):
+    """Hyper-parameters of collecting, estimating advantages and descending gradients."""
+
+    batch_size: int = Field(512, ge=1, description="Transitions in one step of gradient descent.")
+    buffer_size: int = Field(8192, ge=1, description="Transitions collected before an update.")
+    num_epoch: int = Field(3, ge=1, description="Passes over the buffer in an update.")
+    learning_rate_schedule: Schedule = Field(LINEAR, description="Course of the learning rates.")
+    gamma: float = Field(0.99, ge=0.0, le=1.0, description="Discount factor.")
+    lambd: float = Field(0.95, ge=0.0, le=1.0, description="Lambda of the advantage estimate.")
+    normalize_rewards: bool = Field(
+        False, description="Scale rewards by the standard deviation of the discounted returns."
+    )
+    max_gradient_norm: float = Field(0.5, gt=0.0, description="Gradients are clipped to this norm.")
+
+    @model_validator(mode="after")
+    def _batch_fits(self) -> OnPolicyHyperparameters:
+        if self.batch_size > self.buffer_size:
+            raise ValueError(
+                f"batch_size {self.batch_size} is over buffer_size {self.buffer_size}: lower "
+                "batch_size, or raise buffer_size"
+            )
+        return self
+
+
+class OnPolicyAlgorithm:
+    """Acts, collects, descends gradients and keeps the state; a subclass says how to update.
+
+    Args:
+        policy: the actor and the critic, on the device.
+        groups: the parameters that gradient descent moves, one group per learning rate. The rates
+            are the subclass's to set, in each update.
+        hyperparameters: what all algorithms of this kind have.
+        interaction: the environments.
+        generator: the source of all randomness.
+        device: where the policy lives.
+    """
+
+    def __init__(
+        self,
+        policy: ActorCritic,
+        groups: Iterable[Iterable[nn.Parameter]],
+        hyperparameters: OnPolicyHyperparameters,
+        interaction: Interaction,
+        generator: torch.Generator,
+        device: torch.device,
+    ):
+        self.policy = policy
+        self._optimizer = torch.optim.Adam(
+            [{"params": list(group)} for group in groups], eps=1e-5, fused=True
+        )
+        self._gamma, self._lambd = hyperparameters.gamma, hyperparameters.lambd
+        count = interaction.env.num_envs
+        self._collector = OnPolicyCollector(
+            policy,
+            interaction,
+            -(-hyperparameters.buffer_size // count),
+            generator,
+            device,
+            RewardNormalizer(count, self._gamma) if hyperparameters.normalize_rewards else None,
+        )
+        self._max_gradient_norm = hyperparameters.max_gradient_norm
+        self._interaction, self._generator = interaction, generator
+        self._rollout: Rollout | None = None
+
+    def initial_state(self, count: int) -> Tensor:
+        """See `Algorithm.initial_state`."""
+        return self.policy.initial_state(count)
+
+    def act(self, observations: Observations, *, deterministic: bool) -> tuple[Tensor, Tensor]:
+        """See `Algorithm.act`."""
+        distribution, _, state = self.policy.step(observations)
+        actions = distribution.mode() if deterministic else distribution.sample(self._generator)
+        return actions, state
+
+    def collect(self) -> None:
+        """See `Algorithm.collect`."""
+        self._rollout = self._collector.collect(self._gamma, self._lambd)
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Algorithm.state_dict`."""
+        return {
+            "optimizer": self._optimizer.state_dict(),
+            "collector": self._collector.state_dict(),
+            "generator": self._generator.get_state(),
+        }
+
+    def load_state_dict(self, weights: dict[str, Tensor], state: dict[str, Any]) -> None:
+        """See `Algorithm.load_state_dict`."""
+        self.policy.load_state_dict(weights)
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._collector.load_state_dict(state["collector"])
+        self._generator.set_state(state["generator"])
+
+    def _take_rollout(self) -> Rollout:
+        """The experience of the last collection, for one update alone."""
+        rollout, self._rollout = self._rollout, None
+        if rollout is None:
+            raise RuntimeError("update() comes after collect()")
+        return rollout
+
+    def _descend(self, loss: Tensor) -> None:
+        """One step of gradient descent.
+
+        Raises:
+            NonFiniteError: the loss or its gradient is NaN or infinite; nothing was changed.
+        """
+        groups = self._optimizer.param_groups
+        parameters = [p for group in groups for p in group["params"] if p.requires_grad]
+        step = self._interaction.step_count
+        descend(self._optimizer, loss, parameters, self._max_gradient_norm, step)

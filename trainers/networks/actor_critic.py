@@ -1,0 +1,245 @@
+"""The actor and the critic of policy-gradient methods."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Literal
+
+import gymnasium
+import numpy as np
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+
+from trainers.common.errors import UserError
+from trainers.networks.distributions import Categorical, DiagonalGaussian, Distribution
+from trainers.networks.network import NetworkFactory, NetworkSettings, head
+from trainers.networks.observations import Observations
+from trainers.networks.recurrent import MemorySettings
+
+ACTOR_GAIN = 0.01  # a small last layer: at first every observation gets nearly the same action
+CRITIC_GAIN = 1.0
+TINY_STD = 1e-6
+NETWORK_PATH = "trainer.network_settings"
+
+
+class ActorCriticSettings(NetworkSettings, frozen=True, extra="forbid"):
+    """Networks of an actor and a critic, and what each of them sees."""
+
+    actor_observations: tuple[str, ...] | None = Field(
+        None, description="What the policy sees; null: every observation but `privileged`."
+    )
+    critic_observations: tuple[str, ...] | None = Field(
+        None, description="What a separate critic sees; null: what the policy sees."
+    )
+
+
+class PolicySettings(ActorCriticSettings, frozen=True, extra="forbid"):
+    """Networks of the actor and the critic."""
+
+    critic: Literal["shared", "separate"] = Field(
+        "shared", description="A critic on the actor's hidden vector, or one with its own network."
+    )
+    initial_std: float = Field(
+        1.0, gt=0.0, description="Continuous actions: standard deviation to begin with."
+    )
+    min_std: float = Field(
+        0.001, gt=0.0, description="Continuous actions: the standard deviation never falls below."
+    )
+    memory: MemorySettings | None = Field(
+        None, description="A recurrent layer in the actor and in a separate critic; null: none."
+    )
+
+    @model_validator(mode="after")
+    def _critic_can_see(self) -> PolicySettings:
+        if self.critic == "shared" and self.critic_observations is not None:
+            raise ValueError("critic_observations needs critic: separate")
+        if self.min_std > self.initial_std:
+            raise ValueError(
+                f"min_std {self.min_std:g} is over initial_std {self.initial_std:g}: lower it"
+            )
+        return self
+
+
+class ActorCritic(nn.Module):
+    """A policy and a value function.
+
+    Args:
+        factory: builds the networks.
+        settings: what they look like.
+
+    Attributes:
+        state_size: numbers that the actor and a separate critic remember; 0 without memory.
+        sequence_length: steps through which gradients flow back; 1 without memory.
+
+    Raises:
+        UserError: the settings don't fit the environment.
+    """
+
+    def __init__(self, factory: NetworkFactory, settings: PolicySettings):
+        super().__init__()
+        actor, critic = observed(factory, settings)
+        self.actor = factory.network(settings, actor, settings.memory)
+        self.critic = (
+            factory.network(settings, critic, settings.memory)
+            if settings.critic == "separate"
+            else None
+        )
+        self.state_size = self.actor.state_size
+        if self.critic is not None:
+            self.state_size += self.critic.state_size
+        self.sequence_length = 1 if settings.memory is None else settings.memory.sequence_length
+        width = self.actor.features_dim
+        self.action_head: nn.Linear
+        self.log_std: nn.Parameter | None = None
+        self._min_log_std: Tensor
+        match factory.action_space:
+            case gymnasium.spaces.Box(shape=(size,)):
+                self.action_head = head(width, size, ACTOR_GAIN)
+                above = math.log(max(settings.initial_std - settings.min_std, TINY_STD))
+                self.log_std = nn.Parameter(torch.full((size,), above))
+            case gymnasium.spaces.Discrete(n=count):
+                self.action_head = head(width, int(count), ACTOR_GAIN)
+            case other:
+                raise UserError(
+                    f"environment: actions of the space {other} are not supported; a Box of one "
+                    "dimension and Discrete are"
+                )
+        min_log_std = torch.tensor(math.log(settings.min_std))
+        self.register_buffer("_min_log_std", min_log_std, persistent=False)
+        self.value_head = head(
+            width if self.critic is None else self.critic.features_dim, 1, CRITIC_GAIN
+        )
+
+    def initial_state(self, count: int) -> Tensor:
+        """What is remembered where episodes begin, (count, state_size)."""
+        return self.value_head.weight.new_zeros(count, self.state_size)
+
+    def forward(
+        self, observations: Observations, features: FrameFeatures | None = None
+    ) -> tuple[Distribution, Tensor]:
+        """The distribution of actions and the values (B,)."""
+        distribution, values, _ = self.step(observations, features)
+        return distribution, values
+
+    def step(
+        self, observations: Observations, features: FrameFeatures | None = None
+    ) -> tuple[Distribution, Tensor, Tensor]:
+        """The distribution of actions, the values (B,), and the state (S, state_size) after."""
+        known = features or FrameFeatures(None, None)
+        seen_by_actor, seen_by_critic = self._split(observations)
+        hidden, state = self.actor.recall(seen_by_actor, known.actor)
+        distribution, critic_hidden = self._distribution(hidden), hidden
+        if self.critic is not None:
+            critic_hidden, critic_state = self.critic.recall(seen_by_critic, known.critic)
+            state = torch.cat([state, critic_state], dim=1)
+        return distribution, self._value(critic_hidden), state
+
+    def distribution(self, observations: Observations) -> Distribution:
+        """The distribution of actions alone."""
+        return self._distribution(self.actor(self._split(observations)[0]))
+
+    def value(self, observations: Observations, features: FrameFeatures | None = None) -> Tensor:
+        """The values (B,) alone."""
+        known = features or FrameFeatures(None, None)
+        seen_by_actor, seen_by_critic = self._split(observations)
+        if self.critic is None:
+            return self._value(self.actor(seen_by_actor, known.actor))
+        return self._value(self.critic(seen_by_critic, known.critic))
+
+    def encode_frames(self, observations: Observations) -> FrameFeatures:
+        """What the encoders say of frames, to be reused as long as neither changes."""
+        critic = None if self.critic is None else self.critic.encode_frames(observations.frames)
+        return FrameFeatures(self.actor.encode_frames(observations.frames), critic)
+
+    def update_statistics(self, vectors: dict[str, Tensor]) -> None:
+        """Shows vector observations to the encoders that standardise."""
+        for network in filter(None, (self.actor, self.critic)):
+            network.update_statistics(vectors)
+
+    def actor_parameters(self) -> Iterator[nn.Parameter]:
+        """Parameters of the policy; a shared network counts among them."""
+        yield from self.actor.parameters()
+        yield from self.action_head.parameters()
+        if self.log_std is not None:
+            yield self.log_std
+
+    def critic_parameters(self) -> Iterator[nn.Parameter]:
+        """Parameters of the value function alone."""
+        if self.critic is not None:
+            yield from self.critic.parameters()
+        yield from self.value_head.parameters()
+
+    def _distribution(self, hidden: Tensor) -> Distribution:
+        outputs = self.action_head(hidden)
+        if self.log_std is None:
+            return Categorical(outputs)
+        # std = min_std + exp(log_std): a floor that, unlike a clamp, always lets gradients through.
+        return DiagonalGaussian(outputs, torch.logaddexp(self.log_std, self._min_log_std))
+
+    def _value(self, hidden: Tensor) -> Tensor:
+        value: Tensor = self.value_head(hidden).squeeze(-1)
+        return value
+
+    def _split(self, observations: Observations) -> tuple[Observations, Observations]:
+        """The observations with what the actor remembers, and with what the critic does."""
+        sequences = observations.sequences
+        if sequences is None or self.state_size == 0:
+            return observations, observations
+        actor, critic = sequences.state.tensor_split([self.actor.state_size], dim=1)
+        return (
+            replace(observations, sequences=replace(sequences, state=actor)),
+            replace(observations, sequences=replace(sequences, state=critic)),
+        )
+
+
+class FrameFeatures:
+    """Features (B, f) of B frames, as the actor's and the critic's encoders gave them."""
+
+    def __init__(self, actor: Tensor | None, critic: Tensor | None):
+        self.actor, self.critic = actor, critic
+
+    def rows(self, rows: Tensor) -> FrameFeatures:
+        """Those of some rows."""
+        actor, critic = (None if f is None else f[rows] for f in (self.actor, self.critic))
+        return FrameFeatures(actor, critic)
+
+    def with_rows(self, rows: Tensor, other: FrameFeatures) -> FrameFeatures:
+        """These, with other features at some rows."""
+        return FrameFeatures(
+            with_rows(self.actor, rows, other.actor), with_rows(self.critic, rows, other.critic)
+        )
+
+
+def with_rows(features: Tensor | None, rows: Tensor, other: Tensor | None) -> Tensor | None:
+    """Features (B, f) with others in place of some rows; None where there are none."""
+    if features is None or other is None:
+        return None
+    return features.index_copy(0, rows, other)
+
+
+def observed(
+    factory: NetworkFactory, settings: ActorCriticSettings
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the observations that the actor and the critic see.
+
+    Raises:
+        UserError: the environment does not have them.
+    """
+    everything = tuple(factory.observation_space.spaces)
+    actor = settings.actor_observations or tuple(n for n in everything if n != "privileged")
+    critic = settings.critic_observations or actor
+    for path, names in (("actor_observations", actor), ("critic_observations", critic)):
+        for name in names:
+            factory.check_name(name, f"{NETWORK_PATH}.{path}")
+    return actor, critic
+
+
+def to_environment(actions: Tensor, space: gymnasium.Space) -> np.ndarray:
+    """Actions as the environment takes them: within the bounds of a Box."""
+    values = actions.cpu().numpy()
+    if isinstance(space, gymnasium.spaces.Box):
+        return np.clip(values, space.low, space.high)
+    return values

@@ -1,0 +1,172 @@
+"""A deterministic actor and its critic Q(s, a), with the targets that follow them slowly."""
+
+from __future__ import annotations
+
+import copy
+from typing import Annotated, Any, Literal
+
+import gymnasium
+import numpy as np
+import torch
+from pydantic import AfterValidator, Field, model_validator
+from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
+
+from trainers.common.errors import UserError
+from trainers.networks.actor_critic import ACTOR_GAIN, CRITIC_GAIN, ActorCriticSettings, observed
+from trainers.networks.network import Network, NetworkFactory, NetworkSettings, head, hidden_layers
+from trainers.networks.observations import Observations
+
+ENCODERS_ALONE = {"num_layers": 0}
+
+
+def _refuse_memory(value: Any) -> None:
+    if value is not None:
+        raise ValueError(
+            "ddpg has no memory, it learns from single steps: remove the key, or use "
+            "trainer_type: ppo or trpo"
+        )
+
+
+class DeterministicSettings(ActorCriticSettings, frozen=True, extra="forbid"):
+    """Networks of a deterministic actor and of its critic."""
+
+    critic: Literal["separate", "shared"] = Field(
+        "separate",
+        description="A critic with encoders of its own, or encoders shared with the actor, which "
+        "then learn from the critic's loss alone.",
+    )
+    memory: Annotated[Any, AfterValidator(_refuse_memory)] = Field(
+        None, description="Always null: ddpg has no memory."
+    )
+
+    @model_validator(mode="after")
+    def _critic_can_see(self) -> DeterministicSettings:
+        if self.critic == "shared" and self.critic_observations is not None:
+            raise ValueError("critic_observations needs critic: separate")
+        return self
+
+
+class DeterministicActorCritic(nn.Module):
+    """Encoders, the actor mu(s) and the critic Q(s, a). Actions are scaled to [-1, 1].
+
+    Args:
+        factory: builds the encoders.
+        settings: what the networks look like.
+
+    Attributes:
+        actor_sees: names of the observations.
+        critic_sees: the same.
+
+    Raises:
+        UserError: the settings don't fit the environment.
+    """
+
+    def __init__(self, factory: NetworkFactory, settings: DeterministicSettings):
+        super().__init__()
+        self.actor_sees, self.critic_sees = observed(factory, settings)
+        encoders_alone = settings.model_copy(update=ENCODERS_ALONE)
+        self.critic_encoder = factory.network(encoders_alone, self.critic_sees)
+        self.actor_encoder: Network | None = None
+        if settings.critic == "separate":
+            self.actor_encoder = factory.network(encoders_alone, self.actor_sees)
+        size = bounded(factory.action_space).shape[0]
+        actor_inputs = self._acting_encoder.features_dim
+        self.actor = nn.Sequential(*_layers(actor_inputs, size, ACTOR_GAIN, settings), nn.Tanh())
+        critic_inputs = self.critic_encoder.features_dim + size
+        self.critic = nn.Sequential(*_layers(critic_inputs, 1, CRITIC_GAIN, settings))
+
+    def act(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
+        """mu(s): actions (B, A) in [-1, 1]; `encode_frames` may have looked at the frames."""
+        features = self._acting_encoder(observations, frame_features)
+        if self.actor_encoder is None:
+            features = features.detach()
+        actions: Tensor = self.actor(features)
+        return actions
+
+    def encode_frames(self, frames: dict[str, Tensor]) -> Tensor | None:
+        """What the actor makes of frames alone, (U, f); None without cameras."""
+        return self._acting_encoder.encode_frames(frames)
+
+    @property
+    def _acting_encoder(self) -> Network:
+        """What the actor acts on: its own encoders, or those it shares with the critic."""
+        return self.critic_encoder if self.actor_encoder is None else self.actor_encoder
+
+    def value(self, observations: Observations, actions: Tensor) -> Tensor:
+        """Q(s, a), (B,)."""
+        features = self.critic_encoder(observations)
+        values: Tensor = self.critic(torch.cat((features, actions), dim=1))
+        return values.squeeze(1)
+
+    def actor_parameters(self) -> list[nn.Parameter]:
+        """What the policy's loss moves."""
+        own = [] if self.actor_encoder is None else list(self.actor_encoder.parameters())
+        return [*own, *self.actor.parameters()]
+
+    def critic_parameters(self) -> list[nn.Parameter]:
+        """What the critic's loss moves."""
+        return [*self.critic_encoder.parameters(), *self.critic.parameters()]
+
+
+class DeterministicPolicy(nn.Module):
+    """The networks that learn, and their targets.
+
+    Args:
+        factory: builds the encoders.
+        settings: what the networks look like.
+        tau: how far the targets follow at a time.
+
+    Attributes:
+        online: what learns.
+        target: what follows it.
+    """
+
+    _low: Tensor
+    _high: Tensor
+
+    def __init__(self, factory: NetworkFactory, settings: DeterministicSettings, tau: float):
+        super().__init__()
+        self.online = DeterministicActorCritic(factory, settings)
+        self.target = copy.deepcopy(self.online).requires_grad_(False)
+        space = bounded(factory.action_space)
+        self.register_buffer("_low", torch.as_tensor(space.low), persistent=False)
+        self.register_buffer("_high", torch.as_tensor(space.high), persistent=False)
+        self._average = get_ema_multi_avg_fn(1.0 - tau)
+        self._pairs = list(self.target.parameters()), list(self.online.parameters())
+
+    def to_space(self, actions: Tensor) -> Tensor:
+        """Actions in [-1, 1] as the environment's space has them."""
+        return self._low + (actions + 1.0) / 2.0 * (self._high - self._low)
+
+    def follow(self) -> None:
+        """Moves the targets towards what learns: target += tau (online - target)."""
+        self._average(*self._pairs, 0)
+
+    def update_statistics(self, vectors: dict[str, Tensor]) -> None:
+        """Shows vector observations to the encoders that standardise; targets see alike."""
+        self.online.critic_encoder.update_statistics(vectors)
+        if self.online.actor_encoder is not None:
+            self.online.actor_encoder.update_statistics(vectors)
+        for theirs, ours in zip(self.target.buffers(), self.online.buffers(), strict=True):
+            theirs.copy_(ours)
+
+
+def bounded(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
+    """A space of actions that can be scaled to [-1, 1].
+
+    Raises:
+        UserError: it is not one.
+    """
+    match space:
+        case gymnasium.spaces.Box(shape=(_,)) if np.isfinite([space.low, space.high]).all():
+            return space
+    raise UserError(
+        f"trainer: a deterministic policy needs continuous actions within bounds (a Box of one "
+        f"dimension), and this environment's are {space}; use trainer_type: ppo"
+    )
+
+
+def _layers(inputs: int, outputs: int, gain: float, settings: NetworkSettings) -> list[nn.Module]:
+    hidden, width = hidden_layers(inputs, settings)
+    return [*hidden, head(width, outputs, gain)]

@@ -1,0 +1,242 @@
+"""Encoders, a trunk and perhaps memory: from observations to a hidden vector."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Literal, Protocol, cast, runtime_checkable
+
+import gymnasium
+import torch
+from pydantic import BaseModel, Field
+from torch import Tensor, nn
+
+from trainers.common.errors import UserError
+from trainers.networks.observations import Observations, is_frame
+from trainers.networks.recurrent import MemorySettings, Recurrent, Sequences
+from trainers.runfile.registry import suggestion
+from trainers.runfile.settings import Component
+
+ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
+    "relu": nn.ReLU,
+    "tanh": nn.Tanh,
+    "silu": nn.SiLU,
+    "elu": nn.ELU,
+}
+DEFAULT_IMAGE_ENCODER = "simple"
+DEFAULT_VECTOR_ENCODER = "vector"
+
+
+class NetworkSettings(BaseModel, frozen=True, extra="forbid"):
+    """The part of a network after its encoders."""
+
+    hidden_units: int = Field(256, ge=1, description="Units of each hidden layer.")
+    num_layers: int = Field(2, ge=0, description="Hidden layers after the encoders.")
+    activation: Literal["relu", "tanh", "silu", "elu"] = Field(
+        "relu", description="Activation of the hidden layers."
+    )
+    precision: Literal["float32", "bfloat16"] = Field(
+        "float32",
+        description="Numbers that encoders and hidden layers calculate with; bfloat16 is faster "
+        "where the processor knows it. Weights, memory, heads and losses are always float32.",
+    )
+    normalize: bool = Field(
+        False, description="Standardise vector observations whose encoder is not set otherwise."
+    )
+
+
+@runtime_checkable
+class Standardizing(Protocol):
+    """An encoder that standardises by what it has seen."""
+
+    def update_statistics(self, batch: Tensor) -> None:
+        """Shows it raw vectors (B, n)."""
+
+
+class Network(nn.Module):
+    """Encodes observations, passes them through a trunk of dense layers, and perhaps remembers.
+
+    Args:
+        encoders: by the name of the observation; frames and vectors are told apart by `spaces`.
+        spaces: of the same names.
+        settings: the trunk.
+        memory: what follows the trunk, if anything.
+
+    Attributes:
+        features_dim: length of the hidden vector.
+        state_size: numbers that it remembers; 0 without memory.
+    """
+
+    def __init__(
+        self,
+        encoders: Mapping[str, nn.Module],
+        spaces: Mapping[str, gymnasium.Space[Any]],
+        settings: NetworkSettings,
+        memory: MemorySettings | None = None,
+    ):
+        super().__init__()
+        self.frame_encoders = nn.ModuleDict(
+            {k: e for k, e in encoders.items() if is_frame(spaces[k])}
+        )
+        self.vector_encoders = nn.ModuleDict(
+            {k: e for k, e in encoders.items() if not is_frame(spaces[k])}
+        )
+        width = sum(cast(int, encoder.features_dim) for encoder in encoders.values())
+        self.trunk, width = hidden_layers(width, settings)
+        self._lowered = settings.precision == "bfloat16"
+        self.memory = None if memory is None else Recurrent(width, memory)
+        self.features_dim = width if self.memory is None else self.memory.features_dim
+        self.state_size = 0 if self.memory is None else self.memory.state_size
+
+    def encode_frames(self, frames: Mapping[str, Tensor]) -> Tensor | None:
+        """What frames alone decide, (U, f); None for a network without cameras.
+
+        Where there are no vectors that is the whole network, so that experience which shares a
+        frame shares all of its cost.
+        """
+        if not self.frame_encoders:
+            return None
+        with self._precision(next(iter(frames.values())).device):
+            parts = [encoder(frames[name]) for name, encoder in self.frame_encoders.items()]
+            features = _joined(parts)
+            return (features if self.vector_encoders else self.trunk(features)).float()
+
+    def forward(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
+        """Hidden vectors (B, features_dim) alone; see `recall`."""
+        return self.recall(observations, frame_features)[0]
+
+    def recall(
+        self, observations: Observations, frame_features: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Hidden vectors, and what is to be remembered.
+
+        Args:
+            observations: B observations.
+            frame_features: (B, f) what `encode_frames` said of their frames, where it is known.
+
+        Returns:
+            (B, features_dim), and the state (S, state_size) after the last of each sequence;
+            (B, 0) without memory.
+        """
+        hidden = self._react(observations, frame_features)
+        if self.memory is None:
+            return hidden, hidden.new_empty(len(hidden), 0)
+        sequences = observations.sequences
+        if sequences is None:
+            sequences = Sequences.single(hidden.new_zeros(len(hidden), self.state_size))
+        recalled: tuple[Tensor, Tensor] = self.memory(hidden, sequences)
+        return recalled
+
+    def _react(self, observations: Observations, frame_features: Tensor | None) -> Tensor:
+        """What the trunk says (B, ...) of each observation by itself."""
+        if frame_features is None:
+            frame_features = self.encode_frames(observations.frames)
+            if frame_features is not None and observations.frame_index is not None:
+                frame_features = frame_features[observations.frame_index]
+        parts = [] if frame_features is None else [frame_features]
+        if not self.vector_encoders:
+            return parts[0]
+        vectors = observations.vectors
+        with self._precision(next(iter(vectors.values())).device):
+            parts += [encoder(vectors[name]) for name, encoder in self.vector_encoders.items()]
+            return self.trunk(_joined(parts)).float()
+
+    def _precision(self, device: torch.device) -> AbstractContextManager[None]:
+        # Entering autocast costs time even where it is not enabled.
+        return torch.autocast(device.type, torch.bfloat16) if self._lowered else nullcontext()
+
+    def update_statistics(self, vectors: Mapping[str, Tensor]) -> None:
+        """Shows vectors (B, n) to the encoders that standardise."""
+        for name, encoder in self.vector_encoders.items():
+            if name in vectors and isinstance(encoder, Standardizing):
+                encoder.update_statistics(vectors[name])
+
+
+class NetworkFactory:
+    """Builds networks for one run: it knows the spaces and the run file's encoders.
+
+    Args:
+        observation_space: of one environment.
+        action_space: of one environment.
+        encoders: the run file's, by the name of the observation.
+        defaults: the encoder of an observation the run file does not mention, by its space and the
+            network's settings.
+    """
+
+    def __init__(
+        self,
+        observation_space: gymnasium.spaces.Dict,
+        action_space: gymnasium.Space[Any],
+        encoders: Mapping[str, Component],
+        defaults: Callable[[gymnasium.Space[Any], NetworkSettings], Component],
+    ):
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self._encoders, self._defaults = encoders, defaults
+        for name in encoders:
+            self.check_name(name, "encoders")
+
+    def check_name(self, name: str, path: str) -> None:
+        """Refuses observations the environment does not have."""
+        if name not in self.observation_space.spaces:
+            raise UserError(
+                f"{path}: the environment has no observation {name!r}; "
+                f"{suggestion(name, self.observation_space.spaces)}"
+            )
+
+    def network(
+        self,
+        settings: NetworkSettings,
+        names: Sequence[str],
+        memory: MemorySettings | None = None,
+    ) -> Network:
+        """A new network on some of the observations.
+
+        Args:
+            settings: what follows the encoders.
+            names: of the observations.
+            memory: what follows the trunk, if anything.
+
+        Raises:
+            UserError: an encoder does not fit its observation.
+        """
+        spaces = {name: self.observation_space[name] for name in names}
+        encoders = {name: self._encoder(name, space, settings) for name, space in spaces.items()}
+        return Network(encoders, spaces, settings, memory)
+
+    def _encoder(
+        self, name: str, space: gymnasium.Space[Any], settings: NetworkSettings
+    ) -> nn.Module:
+        component = self._encoders.get(name) or self._defaults(space, settings)
+        try:
+            encoder: nn.Module = component.cls(space, component.settings)
+        except ValueError as error:
+            raise UserError(f"encoders.{name} ({component.name}): {error}") from error
+        return encoder
+
+
+def _joined(parts: Sequence[Tensor]) -> Tensor:
+    """Features side by side."""
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts), dim=1)
+
+
+def _orthogonal(layer: nn.Linear, gain: float) -> nn.Linear:
+    nn.init.orthogonal_(layer.weight, gain)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def hidden_layers(inputs: int, settings: NetworkSettings) -> tuple[nn.Sequential, int]:
+    """The dense layers that follow the encoders, and how many numbers come out of them."""
+    layers: list[nn.Module] = []
+    width = inputs
+    for _ in range(settings.num_layers):
+        layers += [_orthogonal(nn.Linear(width, settings.hidden_units), gain=2**0.5)]
+        layers += [ACTIVATIONS[settings.activation]()]
+        width = settings.hidden_units
+    return nn.Sequential(*layers), width
+
+
+def head(inputs: int, outputs: int, gain: float) -> nn.Linear:
+    """A last layer with small, orthogonal weights."""
+    return _orthogonal(nn.Linear(inputs, outputs), gain)

@@ -1,0 +1,141 @@
+"""What a run tells the world: TensorBoard, `status.json`, and means between summaries."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch.utils.tensorboard import SummaryWriter
+
+from trainers.common.files import naming, write_atomically
+
+
+class RunLog:
+    """The log of one run, in its results directory: TensorBoard's event file and `status.json`."""
+
+    def __init__(self, directory: Path, resumed_at: int | None = None) -> None:
+        """Open a new event file.
+
+        Args:
+            directory: the run's results; created if need be.
+            resumed_at: the step of the checkpoint from which the run goes on. TensorBoard then
+                hides what was logged after that step by the run that was cut off, so that no
+                point shows twice. Points at that very step stay.
+
+        Raises:
+            OSError: the directory can't be written; names it.
+        """
+        self._directory = directory
+        # TensorBoard purges from `purge_step` on, that step included.
+        purge_step = None if resumed_at is None else resumed_at + 1
+        with naming(directory):
+            directory.mkdir(parents=True, exist_ok=True)
+            self._writer = SummaryWriter(str(directory), purge_step=purge_step)
+            self._writer.flush()
+
+    def scalars(self, values: Mapping[str, float], step: int) -> None:
+        """Log one point of each curve; when this returns, they are in the file.
+
+        Args:
+            values: by tag, such as `Environment/Cumulative Reward`.
+            step: environment steps taken.
+
+        Raises:
+            OSError: they can't be written (a full disk, say); names the directory.
+        """
+        with self._writing():
+            for tag, value in values.items():
+                self._writer.add_scalar(tag, value, step)
+
+    def text(self, tag: str, text: str, step: int) -> None:
+        """Log a text (TensorBoard shows it as Markdown).
+
+        Raises:
+            OSError: it can't be written; names the directory.
+        """
+        with self._writing():
+            self._writer.add_text(tag, text, step)
+
+    def images(self, tag: str, image: np.ndarray, step: int) -> None:
+        """Log an image.
+
+        Args:
+            tag: its name.
+            image: (height, width, 1 or 3) uint8.
+            step: environment steps taken.
+
+        Raises:
+            OSError: it can't be written; names the directory.
+        """
+        with self._writing():
+            self._writer.add_image(tag, image, step, dataformats="HWC")
+
+    def status(self, values: Mapping[str, Any]) -> None:
+        """Rewrite `status.json`; a reader sees the old content or the new, never a part.
+
+        Args:
+            values: nested dict, list and tuple of plain values, numpy values and paths. Numbers
+                that are not finite become null, as JSON knows none.
+
+        Raises:
+            OSError: it can't be written; names the file.
+            TypeError: a value is none of these.
+        """
+        content = json.dumps(_plain(values), indent=2, allow_nan=False, ensure_ascii=False)
+        write_atomically(self._directory / "status.json", content + "\n")
+
+    def close(self) -> None:
+        """Close the event file; nothing can be logged afterwards.
+
+        Raises:
+            OSError: the rest can't be written; names the directory.
+        """
+        with naming(self._directory):
+            self._writer.close()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        # The writer's thread keeps an error to itself until the next call: flushing brings it out.
+        with naming(self._directory):
+            yield
+            self._writer.flush()
+
+
+class Averager:
+    """Means of named values over everything added since they were last taken."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, float] = {}
+        self._counts: dict[str, int] = {}
+
+    def add(self, values: Mapping[str, float], count: int = 1) -> None:
+        """Add values; each is itself the mean of `count` samples (none are added if it is 0)."""
+        if count == 0:
+            return
+        for name, value in values.items():
+            self._sums[name] = self._sums.get(name, 0.0) + float(value) * count
+            self._counts[name] = self._counts.get(name, 0) + count
+
+    def take(self) -> dict[str, float]:
+        """The mean of each name that got a value; then start anew."""
+        means = {name: total / self._counts[name] for name, total in self._sums.items()}
+        self._sums, self._counts = {}, {}
+        return means
+
+
+def _plain(value: Any) -> Any:
+    """The value as strict JSON can have it."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, (np.generic, np.ndarray)):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value

@@ -1,0 +1,257 @@
+"""The run file: YAML to frozen, validated settings, and back.
+
+Every section names a component by its `type` (the trainer by its `trainer_type`); the registry
+finds its class, and the class's own `Settings` model validates the section's other keys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, Field, TypeAdapter
+
+from curricula.samplers import ParameterValue
+from trainers.runfile.registry import Registries, Registry, UnknownComponentError, suggestion
+from trainers.runfile.validation import InvalidError, Model, not_finite, validate
+from trainers.runfile.yaml_document import (
+    Document,
+    KeyPath,
+    Problem,
+    SettingsError,
+    dump,
+    read,
+    shown,
+)
+
+__all__ = [
+    "Component",
+    "RunSettings",
+    "SettingsError",
+    "WeightedReward",
+    "dump_yaml",
+    "load_run",
+    "resolved",
+]
+
+TYPE_KEY = "type"
+TRAINER_TYPE_KEY = "trainer_type"
+PARAMETERS = TypeAdapter(dict[str, ParameterValue])
+
+
+@dataclass(frozen=True)
+class Component:
+    """A component that a run uses: its class, and its settings, not yet built."""
+
+    name: str
+    """The name it is registered under."""
+    cls: type[Any]
+    settings: BaseModel
+    """An instance of `cls.Settings`."""
+
+
+@dataclass(frozen=True)
+class WeightedReward:
+    """A reward, and the factor it enters the sum with."""
+
+    component: Component
+    weight: float
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Everything that defines a run."""
+
+    environment: Component
+    rewards: tuple[WeightedReward, ...]
+    encoders: dict[str, Component]
+    """By the name of the observation."""
+    curriculum: Component | None
+    environment_parameters: dict[str, ParameterValue]
+    """Values that hold for the whole run, unless the curriculum sets them."""
+    trainer: Component
+    seed: int
+    device: str
+
+
+class _RunFile(BaseModel, frozen=True, extra="forbid"):
+    """The top of the run file; a section left empty is as good as absent."""
+
+    environment: dict[str, Any] = Field(description="The environment: its type and settings.")
+    rewards: list[dict[str, Any]] | None = Field(
+        None, description="The rewards: type, weight (default 1) and settings of each."
+    )
+    encoders: dict[str, dict[str, Any]] | None = Field(
+        None, description="For each observation the encoder's type and settings."
+    )
+    curriculum: dict[str, Any] | None = Field(
+        None, description="The curriculum: its type and settings."
+    )
+    environment_parameters: dict[str, ParameterValue] | None = Field(
+        None, description="Values or samplers of parameters that the environment lists."
+    )
+    trainer: dict[str, Any] = Field(description="The algorithm: its trainer_type and settings.")
+    seed: int = Field(0, ge=0, lt=2**32, description="Seed of everything that is random.")
+    device: str = Field("cpu", min_length=1, description="Device of the networks, as torch has it.")
+
+
+class _Weight(BaseModel, frozen=True, extra="forbid"):
+    weight: float = Field(1.0, description="Factor of the reward in the sum.")
+
+
+def load_run(path: Path, overrides: Sequence[str], registries: Registries) -> RunSettings:
+    """Read, override and validate a run file.
+
+    Args:
+        path: the YAML file.
+        overrides: `KEY=VALUE` each, KEY a dotted path into the file and VALUE YAML.
+        registries: the components that can be named.
+
+    Raises:
+        SettingsError: with everything that is wrong, where it stands, and what is allowed.
+    """
+    document = read(path)
+    for override in overrides:
+        document.override(override)
+    return _Sections(document, registries).run()
+
+
+def resolved(run: RunSettings) -> dict[str, Any]:
+    """Return a run as plain data with every default written out.
+
+    Dumped as YAML and loaded again, it gives an equal run.
+    """
+    data: dict[str, Any] = {"environment": _plain(run.environment)}
+    data["rewards"] = [
+        {TYPE_KEY: reward.component.name, "weight": reward.weight, **_own(reward.component)}
+        for reward in run.rewards
+    ]
+    data["encoders"] = {name: _plain(encoder) for name, encoder in run.encoders.items()}
+    data["curriculum"] = run.curriculum and _plain(run.curriculum)
+    data["environment_parameters"] = PARAMETERS.dump_python(run.environment_parameters, mode="json")
+    data["trainer"] = _plain(run.trainer, TRAINER_TYPE_KEY)
+    return {**data, "seed": run.seed, "device": run.device}
+
+
+def dump_yaml(run: RunSettings) -> str:
+    """Write `resolved(run)` as YAML."""
+    return dump(resolved(run))
+
+
+def _plain(component: Component, type_key: str = TYPE_KEY) -> dict[str, Any]:
+    return {type_key: component.name, **_own(component)}
+
+
+def _own(component: Component) -> dict[str, Any]:
+    return component.settings.model_dump(mode="json", by_alias=True, round_trip=True)
+
+
+class _Sections:
+    """Validates the sections of a document, gathering the problems of all of them."""
+
+    def __init__(self, document: Document, registries: Registries) -> None:
+        self.document = document
+        self.registries = registries
+        self.problems: list[Problem] = []
+
+    def run(self) -> RunSettings:
+        for path in not_finite(self.document.data):
+            self.problem(path, "should be a finite number")
+        if self.problems:
+            raise SettingsError(self.problems)
+        top = self.validate(_RunFile, self.document.data, ())
+        # The sections are looked at even where the top is wrong, to tell everything at once.
+        found = self.registries
+        environment = self.component("environment", found.environments)
+        rewards = self.rewards()
+        encoders = {
+            name: self.section(("encoders", name), section, found.encoders)
+            for name, section in self.mapping("encoders").items()
+            if isinstance(section, dict)
+        }
+        curriculum = self.component("curriculum", found.curricula)
+        trainer = self.component("trainer", found.trainers, TRAINER_TYPE_KEY)
+        if self.problems or top is None or environment is None or trainer is None:
+            raise SettingsError(self.problems)
+        return RunSettings(
+            environment=environment,
+            rewards=tuple(rewards),
+            encoders={name: encoder for name, encoder in encoders.items() if encoder},
+            curriculum=curriculum,
+            environment_parameters=top.environment_parameters or {},
+            trainer=trainer,
+            seed=top.seed,
+            device=top.device,
+        )
+
+    def mapping(self, key: str) -> dict[str, Any]:
+        """Return a section; empty where it is absent or, as was noted at the top, no mapping."""
+        section = self.document.data.get(key)
+        return section if isinstance(section, dict) else {}
+
+    def component(self, key: str, registry: Registry, type_key: str = TYPE_KEY) -> Component | None:
+        section = self.document.data.get(key)
+        if not isinstance(section, dict):
+            return None
+        return self.section((key,), section, registry, type_key)
+
+    def rewards(self) -> list[WeightedReward]:
+        sections = self.document.data.get("rewards")
+        rewards: list[WeightedReward] = []
+        first: dict[str, int] = {}
+        for index, section in enumerate(sections if isinstance(sections, list) else []):
+            if not isinstance(section, dict):
+                continue
+            path = ("rewards", index)
+            own = {key: value for key, value in section.items() if key != "weight"}
+            weighed = {key: value for key, value in section.items() if key == "weight"}
+            component = self.section(path, own, self.registries.rewards, beside=("weight",))
+            weight = self.validate(_Weight, weighed, path)
+            if component is None or weight is None:
+                continue
+            earlier = first.setdefault(component.name, index)
+            if earlier != index:
+                message = f"'{component.name}' is there already, as rewards.{earlier}; keep one"
+                self.problem((*path, TYPE_KEY), message)
+            rewards.append(WeightedReward(component, weight.weight))
+        return rewards
+
+    def section(
+        self,
+        path: KeyPath,
+        section: Mapping[str, Any],
+        registry: Registry,
+        type_key: str = TYPE_KEY,
+        beside: tuple[str, ...] = (),
+    ) -> Component | None:
+        """Find a section's component and validate its settings; None where there is a problem."""
+        name = section.get(type_key)
+        if not isinstance(name, str):
+            wrong = f"should be text, not {shown(name)}" if type_key in section else "missing"
+            names = suggestion("", registry.entries)
+            self.problem((*path, type_key), f"{wrong}: names the {registry.kind}; {names}")
+            return None
+        try:
+            entry = registry.get(name)
+        except UnknownComponentError as error:
+            message = f"{error} (`python -m trainers.plugins` lists all)"
+            self.problem((*path, type_key), message)
+            return None
+        own = {key: value for key, value in section.items() if key != type_key}
+        settings = self.validate(entry.settings, own, path, (type_key, *beside))
+        return None if settings is None else Component(name, entry.cls, settings)
+
+    def validate(
+        self, model: type[Model], data: Any, path: KeyPath, beside: tuple[str, ...] = ()
+    ) -> Model | None:
+        try:
+            return validate(model, data, beside)
+        except InvalidError as error:
+            for inner, message in error.problems:
+                self.problem((*path, *inner), message)
+            return None
+
+    def problem(self, path: KeyPath, message: str) -> None:
+        self.problems.append(Problem(self.document.where(path), path, message))
