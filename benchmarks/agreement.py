@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from envs.grasp.camera import Views
-from envs.grasp.scene import Scenes, SceneSampler
+from envs.grasp.scene.sampler import Scenes, SceneSampler
+from envs.grasp.sensors.camera import Views
 from envs.grasp.settings import Camera, GraspSettings, Support
 from envs.grasp.simulators.base import Contacts, Simulator
 from envs.grasp.simulators.fast import FastSimulator

@@ -26,7 +26,7 @@ from rich.console import Console
 from torch import Tensor
 from torch.nn import functional as F
 
-from envs.grasp.scene import heading
+from envs.grasp.scene.sampler import heading
 from envs.grasp.task import goal_middle_m
 from envs.grasp.vector_env import GraspVectorEnv
 from trainers.algorithms.ddpg import DDPGSettings

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from envs.grasp.env import make_vector_env
-from envs.grasp.scene import heading
+from envs.grasp.scene.sampler import heading
 from trainers.reporting.images import picture
 
 SEED = 3

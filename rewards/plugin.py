@@ -1,7 +1,7 @@
 """The rewards that ventosa brings along."""
 
-from rewards.events import Collision, Position, Rotation, Sparse, Touch
-from rewards.shaping import Approach, Facing, Precision
+from rewards.grasp.events import Collision, Position, Rotation, Sparse, Touch
+from rewards.grasp.shaping import Approach, Facing, Precision
 from trainers.hookspecs import hookimpl
 
 

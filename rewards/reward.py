@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rewards.transition import Transition
+from rewards.grasp.transition import Transition
 
 
 class Reward(Protocol):

@@ -33,8 +33,8 @@ def ventosa_encoders() -> dict[str, type]:  # type: ignore[empty-body]
 def ventosa_rewards() -> dict[str, type]:  # type: ignore[empty-body]
     """Offer rewards: name -> class whose instances are callable.
 
-    It is built as `cls(settings)`, and maps a `rewards.transition.Transition` of N environments to
-    an array (N,) of floats. The weight of the run file is applied by the environment.
+    It is built as `cls(settings)`, and maps a `rewards.grasp.transition.Transition` of N
+    environments to an array (N,) of floats. The environment applies the run file's weight.
     """
 
 

@@ -10,8 +10,8 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage, RgbImage
-from envs.grasp.camera import focal_length_px
-from envs.grasp.episodes import Episodes
+from envs.grasp.episode_state import Episodes
+from envs.grasp.sensors.camera import focal_length_px
 from envs.grasp.settings import GraspSettings
 
 PRIVILEGED = "privileged"

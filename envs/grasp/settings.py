@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
-from envs.grasp.blocks import MIN_BAR_M
+from envs.grasp.scene.blocks import MIN_BAR_M
 
 
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:

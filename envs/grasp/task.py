@@ -11,12 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.grasp.batch import Batch
-from envs.grasp.kinematics import InverseKinematics, joint_path, motion_duration_s, tooltip_pose
-from envs.grasp.robot import HOME_JOINTS_RAD, load_robot
-from envs.grasp.scene import Scenes, heading
+from envs.grasp.robot.kinematics import (
+    InverseKinematics,
+    joint_path,
+    motion_duration_s,
+    tooltip_pose,
+)
+from envs.grasp.robot.urdf import HOME_JOINTS_RAD, load_robot
+from envs.grasp.scene.sampler import Scenes, heading
 from envs.grasp.settings import Goal, Workspace
 from envs.grasp.simulators.base import Contacts
-from rewards.transition import Transition
+from rewards.grasp.transition import Transition
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -16,18 +16,18 @@ from numpy.typing import NDArray
 from curricula.samplers import ParameterValue, draw
 from encoders.spaces import DepthImage
 from envs.environment import Environment, Observations, StepResult
-from envs.grasp.aims import Aims
-from envs.grasp.album import GraspAlbum
-from envs.grasp.camera import Views, overviews
-from envs.grasp.episodes import Episodes
+from envs.grasp.episode_state import Episodes
+from envs.grasp.evaluation.pick import PickCheck, Picker
+from envs.grasp.evaluation.pose_commands import Aims
+from envs.grasp.evaluation.report import GraspAlbum
 from envs.grasp.observations import PRIVILEGED, observation_space, privileged_state
-from envs.grasp.pick import PickCheck, Picker
-from envs.grasp.scene import Scenes, SceneSampler
+from envs.grasp.scene.sampler import Scenes, SceneSampler
+from envs.grasp.sensors.camera import Views, overviews
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.factory import make_simulator
 from envs.grasp.task import Arm, GoalRegion, Motion, Progress, advance, goal_middle_m, judge
+from rewards.grasp.transition import Transition
 from rewards.reward import RewardTerm, weigh
-from rewards.transition import Transition
 
 GOAL_PARAMETERS = ("lateral_limit_m", "vertical_limit_m", "gap_limit_m", "yaw_limit_deg")
 
@@ -155,7 +155,7 @@ class GraspVectorEnv(Environment):
     # -- evaluation's interface ------------------------------------------------------------------
 
     def physical_check(self, *, window: bool = False) -> PickCheck:
-        """The pick; see `Environment.physical_check` and `envs.grasp.pick`."""
+        """The pick; see `Environment.physical_check` and `envs.grasp.evaluation.pick`."""
         picker = Picker(self._settings.support, self._settings.pick, window)
         return PickCheck(picker, self._aims)
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from envs.grasp.scene import Scenes
+from envs.grasp.scene.sampler import Scenes
 
 # Position (x, y), yaw (rad) and size (depth, width, height) of a block that is one box.
 BoxBlock = tuple[tuple[float, float], float, tuple[float, float, float]]

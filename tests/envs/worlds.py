@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from envs.grasp.camera import Views, sample_views
-from envs.grasp.kinematics import InverseKinematics
-from envs.grasp.robot import HOME_JOINTS_RAD, load_robot
-from envs.grasp.scene import Scenes, SceneSampler
+from envs.grasp.robot.kinematics import InverseKinematics
+from envs.grasp.robot.urdf import HOME_JOINTS_RAD, load_robot
+from envs.grasp.scene.sampler import Scenes, SceneSampler
+from envs.grasp.sensors.camera import Views, sample_views
 from envs.grasp.settings import Camera, GraspSettings
 
 ROBOT = load_robot()

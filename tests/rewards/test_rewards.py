@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from pydantic import ValidationError
 
+from rewards.grasp.transition import Transition
 from rewards.plugin import ventosa_rewards
-from rewards.transition import Transition
 
 REWARDS = ventosa_rewards()
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from envs.grasp.album import GraspAlbum
+from envs.grasp.evaluation.report import GraspAlbum
 from trainers import evaluation
 from trainers.common.errors import UserError
 from trainers.evaluate import main

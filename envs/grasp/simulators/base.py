@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
 from envs.environment import EnvironmentFailure
-from envs.grasp.camera import Views
-from envs.grasp.scene import Scenes
+from envs.grasp.scene.sampler import Scenes
+from envs.grasp.sensors.camera import Views
 
 Indices = NDArray[np.int64]
 Floats = NDArray[np.float64]

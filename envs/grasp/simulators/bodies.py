@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import pybullet
 
-from envs.grasp.robot import KR16_URDF
-from envs.grasp.scene import Scenes
+from envs.grasp.robot.urdf import KR16_URDF
+from envs.grasp.scene.sampler import Scenes
 from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.base import Floats, Images
 from envs.grasp.simulators.colors import SUPPORT_RGBA

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from encoders.spaces import MM_PER_M, UINT8_MAX, DepthImage
-from envs.grasp.camera import Views, focal_length_px
-from envs.grasp.robot import Box, Robot, load_robot
-from envs.grasp.scene import Scenes
+from envs.grasp.robot.urdf import Box, Robot, load_robot
+from envs.grasp.scene.sampler import Scenes
+from envs.grasp.sensors.camera import Views, focal_length_px
 from envs.grasp.settings import Support
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
 from envs.grasp.simulators.colors import BLOCK_RGBA, SUPPORT_RGBA
@@ -25,7 +25,7 @@ from envs.grasp.simulators.kernels.pictures import (
     take_pictures,
 )
 from envs.grasp.simulators.kernels.worlds import RobotArrays, WorldArrays
-from envs.grasp.team import Team
+from envs.grasp.simulators.thread_pool import Team
 
 CUP = "cup"
 ORTHONORMAL_TOLERANCE = 1e-6

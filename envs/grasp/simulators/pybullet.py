@@ -11,8 +11,8 @@ import pybullet
 from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
-from envs.grasp.camera import Views, focal_length_px, sense_depth
-from envs.grasp.scene import Scenes
+from envs.grasp.scene.sampler import Scenes
+from envs.grasp.sensors.camera import Views, focal_length_px, sense_depth
 from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
 from envs.grasp.simulators.bodies import (

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
-from envs.grasp.camera import Views
-from envs.grasp.scene import Scenes
+from envs.grasp.scene.sampler import Scenes
+from envs.grasp.sensors.camera import Views
 from envs.grasp.settings import Support
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices, SimulatorError
 from envs.grasp.simulators.pybullet import PyBulletSimulator

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
-from rewards.transition import Transition
+from rewards.grasp.transition import Transition
 
 
 class Near:

@@ -35,7 +35,7 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 class RobotArrays(NamedTuple):
-    """A robot of J joints, L links and S shapes; see `envs.grasp.robot.Robot`.
+    """A robot of J joints, L links and S shapes; see `envs.grasp.robot.urdf.Robot`.
 
     Attributes:
         parents, joints: (L,) parent and joint of each link, -1 for none.

@@ -1,0 +1,132 @@
+"""Scenes: three blocks on a table, a light and the cameras, drawn at every reset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.grasp.batch import Batch
+from envs.grasp.scene.placement import place_blocks, rules
+from envs.grasp.sensors.camera import Views, sample_views
+from envs.grasp.settings import GraspSettings, Randomize
+from envs.grasp.simulators.thread_pool import Team
+
+Floats = NDArray[np.float64]
+
+
+class SceneError(ValueError):
+    """The ranges of the run file leave no room for a scene."""
+
+
+@dataclass(frozen=True)
+class Scenes(Batch):
+    """n scenes with B blocks each; block 0 is the target.
+
+    Attributes:
+        box_center_m, box_half_m: (n, B, 3, 3) boxes of the blocks in their body frames.
+        block_position_m: (n, B, 3) body origins, world frame.
+        block_yaw_rad: (n, B) yaw of the bodies; a tool with the same yaw faces the block squarely.
+        target_m: (n, 3) grasp point of block 0, world frame.
+        light_direction: (n, 3) unit vector towards the light.
+        light_intensity: (n,) diffuse share of the light.
+    """
+
+    box_center_m: Floats
+    box_half_m: Floats
+    block_position_m: Floats
+    block_yaw_rad: Floats
+    target_m: Floats
+    light_direction: Floats
+    light_intensity: Floats
+
+    @property
+    def target_yaw_rad(self) -> Floats:
+        """(n,) yaw at which a tool faces the target squarely."""
+        return self.block_yaw_rad[:, 0]
+
+
+def heading(yaw_rad: Floats) -> Floats:
+    """Horizontal unit vectors (..., 3) along a yaw (...)."""
+    return np.stack([np.cos(yaw_rad), np.sin(yaw_rad), np.zeros_like(yaw_rad)], axis=-1)
+
+
+def to_world(points_m: Floats, position_m: Floats, yaw_rad: Floats) -> Floats:
+    """Points (..., k, 3) of a body frame at (..., 3) with yaw (...), in the world frame."""
+    cosine, sine = np.cos(yaw_rad)[..., None], np.sin(yaw_rad)[..., None]
+    x, y, z = np.moveaxis(points_m, -1, 0)
+    turned = np.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=-1)
+    return turned + position_m[..., None, :]
+
+
+class SceneSampler:
+    """Draws scenes by rejection: every candidate obeys the ranges, the acceptable ones are kept."""
+
+    def __init__(self, settings: GraspSettings):
+        self._settings = settings
+        self._rules = rules(settings)
+        self._team = Team()
+
+    def sample(
+        self, rng: np.random.Generator, yaw_limit_rad: Floats
+    ) -> tuple[Scenes, dict[str, Views]]:
+        """Draws n scenes and where each of the cameras stands in them.
+
+        Args:
+            rng: the source of randomness.
+            yaw_limit_rad: (n,) narrows the range of the blocks' yaw to +- this.
+
+        Raises:
+            SceneError: no acceptable scene was found in many tries.
+        """
+        n, blocks, randomize = len(yaw_limit_rad), self._settings.blocks, self._settings.randomize
+        position_m, rotation_deg = randomize.camera_position_m, randomize.camera_rotation_deg
+        views = {
+            name: sample_views(camera, rng, n, position_m, rotation_deg)
+            for name, camera in self._settings.cameras.items()
+        }
+        scenes = Scenes(
+            box_center_m=np.empty((n, blocks, 3, 3)),
+            box_half_m=np.empty((n, blocks, 3, 3)),
+            block_position_m=np.empty((n, blocks, 3)),
+            block_yaw_rad=np.empty((n, blocks)),
+            target_m=np.empty((n, 3)),
+            light_direction=_light_directions(rng, randomize, n),
+            light_intensity=rng.uniform(*randomize.light_intensity, n),
+        )
+        streams = np.zeros((n, 2), np.uint64)
+        streams[:, 0] = rng.integers(2**64, size=n, dtype=np.uint64)
+        found = np.empty(n, bool)
+        place = partial(
+            place_blocks,
+            self._rules,
+            streams,
+            yaw_limit_rad,
+            np.stack([view.position_m for view in views.values()], axis=1),
+            np.stack([view.rotation for view in views.values()], axis=1),
+            scenes.box_center_m,
+            scenes.box_half_m,
+            scenes.block_position_m,
+            scenes.block_yaw_rad,
+            scenes.target_m,
+            found,
+        )
+        self._team.share(place, n)
+        if not found.all():
+            raise SceneError(
+                f"no scene with {blocks} blocks fits: widen environment.randomize.block_x_m and "
+                "block_y_m, lower blocks or target_lead_m, or let the cameras see more (fov_deg, "
+                "position_m)"
+            )
+        return scenes, views
+
+
+def _light_directions(rng: np.random.Generator, randomize: Randomize, n: int) -> Floats:
+    """Unit vectors (n, 3) towards the light."""
+    azimuth = np.radians(rng.uniform(*randomize.light_azimuth_deg, n))
+    elevation = np.radians(rng.uniform(*randomize.light_elevation_deg, n))
+    direction = heading(azimuth) * np.cos(elevation)[:, None]
+    direction[:, 2] = np.sin(elevation)
+    return direction

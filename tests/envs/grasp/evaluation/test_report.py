@@ -1,0 +1,135 @@
+"""The album of an evaluation: what is judged, and what is drawn."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from envs.grasp.env import make_vector_env
+from envs.grasp.evaluation import report as album_module
+from envs.grasp.evaluation.film import film
+from envs.grasp.evaluation.plots import AIM_COLOR, contact_sheet
+from envs.grasp.scene.sampler import heading
+from envs.grasp.sensors.camera import project
+from envs.grasp.settings import Camera, Pick, Support
+from envs.grasp.vector_env import GraspVectorEnv
+
+SHOWN, ENVS = 7, 8
+
+
+@pytest.fixture(autouse=True)
+def few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(album_module, "SHOWN", SHOWN)
+    monkeypatch.setattr(album_module, "FILMED", 1)
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[GraspVectorEnv]:
+    made = make_vector_env(ENVS, simulator="fast", seed=1)
+    made.reset()
+    yield made
+    made.close()
+
+
+def actions(env: GraspVectorEnv, *, ahead: float, up: float, yaw_deg: float) -> np.ndarray:
+    """Aims that far from the grasp points."""
+    scenes = env.scenes
+    tooltip = scenes.target_m + ahead * heading(scenes.target_yaw_rad) + [0.0, 0.0, up]
+    return env.action_for(tooltip, scenes.target_yaw_rad + np.radians(yaw_deg))
+
+
+def outcomes(*, success: int) -> dict[str, np.ndarray]:
+    good = np.arange(ENVS) < success
+    return {"success": good, "no_seal": ~good}
+
+
+def test_errors_are_those_to_the_middle_of_the_goal_region(env: GraspVectorEnv) -> None:
+    album = env.album()
+    album.add(actions(env, ahead=-0.025, up=0.004, yaw_deg=-3.0), outcomes(success=1))
+    (judged,) = album._judged
+    # The region's gap goes from 10 to 20 mm.
+    np.testing.assert_allclose(judged.error_m, np.tile([0.0, 0.004, 0.01], (ENVS, 1)), atol=1e-9)
+    np.testing.assert_allclose(judged.yaw_error_deg, -3.0)
+    np.testing.assert_allclose(judged.distance_m, np.hypot(0.004, 0.01))
+    assert len(album._shots) == SHOWN
+    assert album._shots[0].caption == "10.8 mm, 3.0 deg   picked"
+    assert album._shots[1].caption == "10.8 mm, 3.0 deg   no seal"
+
+
+@pytest.mark.parametrize("checked", [True, False])
+def test_all_files_are_drawn_and_can_be_opened(env: GraspVectorEnv, checked: bool) -> None:
+    album = env.album()
+    found = outcomes(success=ENVS) if checked else {}
+    for _ in range(2):
+        album.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), found)
+    files = dict(album.files())
+    assert tuple(files) == album.file_names
+    for name, content in files.items():
+        with Image.open(io.BytesIO(content)) as image:
+            image.load()
+            assert min(image.size) > 300, name
+
+
+def test_the_film_goes_on_to_the_pick_only_where_there_is_one(env: GraspVectorEnv) -> None:
+    lengths_ms = []
+    for found in ({}, outcomes(success=ENVS)):
+        album = env.album()
+        album.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), found)
+        content = film(album._shots[:1], Support(), Pick(), bool(found))
+        with Image.open(io.BytesIO(content)) as image:
+            assert image.info["loop"] == 0
+            lengths_ms.append(0)
+            for frame in range(image.n_frames):  # type: ignore[attr-defined]
+                image.seek(frame)
+                lengths_ms[-1] += image.info["duration"]
+    # Lifting takes one second, and holding another.
+    assert lengths_ms[1] - lengths_ms[0] > 2000
+
+
+def test_the_cup_is_drawn_where_the_camera_would_see_it(
+    env: GraspVectorEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines: list[tuple[Any, Any]] = []
+    monkeypatch.setattr(
+        "matplotlib.axes.Axes.plot",
+        lambda self, u, v, color, **_: lines.append((u, v)) if color == AIM_COLOR else None,
+    )
+    album = env.album()
+    album.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), {})
+    shot = album._shots[0]
+    contact_sheet([shot], np.zeros(3))
+    (rim_u, rim_v), (stem_u, stem_v) = lines
+    u, v, depth = project(shot.view, shot.tooltip_m[None, None])[0, 0]
+    assert (stem_u[0], stem_v[0]) == (pytest.approx(u), pytest.approx(v))
+    # The rim is round the tooltip, 30 mm away: up and down these are f * 30 mm / depth pixels.
+    focal_px = 80 / 2 / np.tan(np.radians(44.0) / 2)
+    assert rim_u.min() < u < rim_u.max()
+    assert np.ptp(rim_v) == pytest.approx(2 * focal_px * 0.03 / depth, rel=0.1)
+
+
+def test_an_rgb_camera_alone_will_do() -> None:
+    env = make_vector_env(1, simulator="fast", cameras={"top": Camera(type="rgb")})
+    try:
+        env.reset()
+        album = env.album()
+        album.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), {})
+        assert next(iter(album.files()))[1].startswith(b"\x89PNG")
+    finally:
+        env.close()
+
+
+def test_without_matplotlib_the_message_says_what_to_install(
+    env: GraspVectorEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "matplotlib" else find_spec(name)
+    )
+    with pytest.raises(ValueError, match=r"matplotlib.*\[render\]"):
+        env.album()

@@ -1,0 +1,206 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from encoders.spaces import DepthImage
+from envs.grasp.sensors.camera import (
+    Views,
+    euler_rotations,
+    focal_length_px,
+    look_at,
+    project,
+    sample_views,
+    sense_depth,
+)
+from envs.grasp.settings import Camera
+
+# A square 90 degree camera at (1, 2, 3) that looks along +x: focal length 50 px.
+FORWARD = Camera(
+    type="depth", width=100, height=60, fov_deg=90, position_m=(1, 2, 3), target_m=(5, 2, 3)
+)
+
+
+def fixed(camera: Camera, count: int = 1) -> Views:
+    return sample_views(camera, np.random.default_rng(0), count, 0.0, 0.0)
+
+
+def test_focal_length_comes_from_the_horizontal_field_of_view() -> None:
+    assert focal_length_px(FORWARD) == pytest.approx(50.0)
+    narrow = Camera(type="depth", width=80, fov_deg=60)
+    assert focal_length_px(narrow) == pytest.approx(40 * np.sqrt(3))
+
+
+def test_project_hand_computed() -> None:
+    points = np.array([[(3, 2, 3), (3, 1, 3), (3, 2, 3.5), (6, 3, 2), (0, 2, 3)]], float)
+    # to the right of a camera that looks along x is -y; rows count downwards
+    np.testing.assert_allclose(
+        project(fixed(FORWARD), points),
+        [[(50, 30, 2), (75, 30, 2), (50, 17.5, 2), (40, 40, 5), (50, 30, -1)]],
+        atol=1e-12,
+    )
+
+
+def test_project_takes_each_environments_own_camera() -> None:
+    views = fixed(FORWARD, 2).with_arrays({"position_m": np.array([(1.0, 2, 3), (2.0, 2, 3)])})
+    points = np.tile([3.0, 1.0, 3.0], (2, 1, 1))
+    np.testing.assert_allclose(project(views, points), [[(75, 30, 2)], [(100, 30, 1)]])
+
+
+@pytest.mark.parametrize(
+    ("target", "right", "down"),
+    [
+        ((5, 0, 0), (0, -1, 0), (0, 0, -1)),
+        ((0, 5, 0), (1, 0, 0), (0, 0, -1)),
+        ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
+        ((1, 0, -1), (0, -1, 0), (-np.sqrt(0.5), 0, -np.sqrt(0.5))),
+        ((0, 0, -2), (0, -1, 0), (-1, 0, 0)),  # straight down: the image's top is +x
+    ],
+)
+def test_look_at_hand_computed(
+    target: tuple[float, ...], right: tuple[float, ...], down: tuple[float, ...]
+) -> None:
+    axes = look_at(np.zeros(3), np.array(target, float))
+    expected = np.stack([right, down, np.array(target) / np.linalg.norm(target)], axis=1)
+    np.testing.assert_allclose(axes, expected, atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+
+
+def test_rolled_camera_sees_the_world_turned_the_other_way() -> None:
+    axes = look_at(np.zeros(3), np.array([5.0, 0, 0]), np.pi / 2)
+    # Turned clockwise by a quarter, what was to its right (-y) is now up in its image.
+    expected = np.stack([(0, 0, -1), (0, 1, 0), (1, 0, 0)], axis=1)
+    np.testing.assert_allclose(axes, expected, atol=1e-12)
+
+
+def test_roll_leaves_the_middle_of_the_image_where_it_is() -> None:
+    upright = Camera(type="depth", width=80, height=80)
+    rolled = upright.model_copy(update={"roll_deg": 45.0})
+    points = np.array([upright.target_m, (1.0, 0.2, 0.7)])[None]
+    before = project(fixed(upright), points)[0]
+    after = project(fixed(rolled), points)[0]
+    assert after[0] == pytest.approx(before[0])
+    # A turn of the camera by +45 degrees turns the image by -45 about its middle.
+    cosine = np.sqrt(0.5)
+    turned = np.array([[cosine, cosine], [-cosine, cosine]]) @ (before[1, :2] - 40.0) + 40.0
+    np.testing.assert_allclose(after[1], [*turned, before[1, 2]], atol=1e-9)
+
+
+def test_the_point_looked_at_is_in_the_middle_of_the_image() -> None:
+    camera = Camera(type="depth", width=90, height=70)
+    u, v, depth = project(fixed(camera), np.array(camera.target_m)[None, None])[0, 0]
+    assert (u, v) == pytest.approx((45.0, 35.0))
+    distance = np.subtract(camera.target_m, camera.position_m)
+    assert depth == pytest.approx(np.sqrt((distance**2).sum()))
+
+
+def test_euler_rotations_turn_about_x_then_y_then_z() -> None:
+    quarter = np.pi / 2
+    turns = euler_rotations(
+        np.array([(quarter, 0, 0), (0, quarter, 0), (0, 0, quarter), (quarter, quarter, 0)])
+    )
+    x, y, z = np.eye(3)
+    np.testing.assert_allclose(turns[0], np.stack([x, z, -y], 1), atol=1e-12)
+    np.testing.assert_allclose(turns[1], np.stack([-z, y, x], 1), atol=1e-12)
+    np.testing.assert_allclose(turns[2], np.stack([y, -x, z], 1), atol=1e-12)
+    np.testing.assert_allclose(turns[3], turns[1] @ turns[0], atol=1e-12)
+
+
+def test_sampled_views_stay_in_their_ranges_and_use_them() -> None:
+    camera = Camera(type="depth", noise_sigma_m=0.004)
+    views = sample_views(camera, np.random.default_rng(0), 3000, 0.02, 3.0)
+    moved = views.position_m - camera.position_m
+    assert np.abs(moved).max() <= 0.02
+    assert (np.abs(moved).max(0) > 0.0195).all()
+    np.testing.assert_allclose(
+        views.rotation @ np.swapaxes(views.rotation, 1, 2),
+        np.tile(np.eye(3), (3000, 1, 1)),
+        atol=1e-9,
+    )
+    square = look_at(np.array(camera.position_m), np.array(camera.target_m))
+    relative = square.T @ views.rotation
+    angle = np.degrees(np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    assert 4.2 < angle.max() <= 3 * np.sqrt(3) + 0.1
+    for values, (low, high) in ((views.near_m, (0.05, 0.1)), (views.far_m, (2.5, 3.0))):
+        assert low <= values.min() < low + 0.02 * (high - low)
+        assert high - 0.02 * (high - low) < values.max() <= high
+    np.testing.assert_array_equal(views.noise_sigma_m, 0.004)
+
+
+# -- the sensor ----------------------------------------------------------------------------------
+
+FLAT = np.full((1, 200, 300), 1.0, np.float32)
+
+
+def sense(
+    depth: np.ndarray, encoding: str = "uint16", sigma: float = 0.005, seed: int = 1
+) -> np.ndarray:
+    """Metres as they are delivered, from one picture."""
+    space = DepthImage(*depth.shape[1:], (0.4, 2.0), encoding)
+    raw = sense_depth(depth, space, np.array([sigma]), np.array([seed], np.uint64))
+    assert raw.shape == (*depth.shape, 1)
+    assert raw.dtype == space.dtype
+    raw = raw[..., 0].astype(float)
+    return raw / 1000 if encoding == "uint16" else 0.4 + raw * 1.6 / 255
+
+
+@pytest.mark.parametrize("encoding", ["uint16", "uint8"])
+def test_noise_is_gaussian_around_the_true_depth(encoding: str) -> None:
+    sigma = 0.02  # some steps of the coarse encoding
+    error = sense(FLAT, encoding, sigma) - 1.0
+    step = 0.001 if encoding == "uint16" else 1.6 / 255
+    spread = np.sqrt(sigma**2 + step**2 / 12)  # the rounding's own is uniform
+    assert abs(error.mean()) < 5 * spread / np.sqrt(FLAT.size)
+    assert error.std() == pytest.approx(spread, rel=0.02)
+    for count, share in ((1, 0.683), (2, 0.954), (3, 0.9973)):
+        assert (np.abs(error) < count * sigma).mean() == pytest.approx(share, abs=0.06)
+
+
+def test_noise_is_independent_between_pixels() -> None:
+    error = sense(FLAT, sigma=0.02)[0] - 1.0
+    for other in (np.roll(error, 1, 0), np.roll(error, 1, 1)):
+        assert abs(np.corrcoef(error.ravel(), other.ravel())[0, 1]) < 0.02
+
+
+@pytest.mark.parametrize("encoding", ["uint16", "uint8"])
+def test_no_noise_leaves_only_the_encodings_rounding(encoding: str) -> None:
+    depth = np.linspace(0.4, 2.0, 900, dtype=np.float32).reshape(1, 30, 30)
+    step = 0.001 if encoding == "uint16" else 1.6 / 255
+    error = sense(depth, encoding, sigma=0.0) - depth
+    assert 0.4 * step < np.abs(error).max() <= 0.501 * step
+
+
+@pytest.mark.parametrize("encoding", ["uint16", "uint8"])
+def test_values_are_clamped_after_the_noise(encoding: str) -> None:
+    depth = np.array([[[0.1, 0.4, 2.0, 5.0, np.inf]]], np.float32).repeat(500, axis=1)
+    sensed = sense(depth, encoding, sigma=0.01)[0]
+    assert sensed.min() == pytest.approx(0.4)
+    assert sensed.max() == pytest.approx(2.0)
+    np.testing.assert_allclose(sensed[:, 0], 0.4)
+    np.testing.assert_allclose(sensed[:, 3:], 2.0)
+    assert (sensed[:, 1] > 0.4).any()
+    assert (sensed[:, 2] < 2.0).any()
+
+
+def test_noise_depends_on_its_seed_alone() -> None:
+    space = DepthImage(20, 20)
+    depth, sigma = np.full((3, 20, 20), 1.0, np.float32), np.full(3, 0.01)
+    many = sense_depth(depth, space, sigma, np.array([5, 6, 5], np.uint64))
+    np.testing.assert_array_equal(many[0], many[2])
+    assert (many[0] != many[1]).mean() > 0.8
+    alone = sense_depth(depth[:1], space, sigma[:1], np.array([6], np.uint64))
+    np.testing.assert_array_equal(alone[0], many[1])
+
+
+def test_every_picture_has_its_own_sigma() -> None:
+    space = DepthImage(100, 100)
+    depth = np.full((3, 100, 100), 1.0, np.float32)
+    seeds = np.array([1, 2, 3], np.uint64)
+    sensed = sense_depth(depth, space, np.array([0.0, 0.01, 0.05]), seeds)
+    assert sensed.std(axis=(1, 2, 3)) == pytest.approx([0.0, 10.0, 50.0], rel=0.03)
+
+
+def test_true_depth_is_left_alone() -> None:
+    depth = FLAT.copy()
+    sense(depth)
+    np.testing.assert_array_equal(depth, FLAT)

@@ -1,0 +1,632 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from curricula.samplers import (
+    GaussianParameters,
+    GaussianSampler,
+    UniformParameters,
+    UniformSampler,
+)
+from encoders.spaces import DepthImage, RgbImage
+from envs.grasp.scene.sampler import heading
+from envs.grasp.settings import Camera, GraspSettings
+from envs.grasp.simulators.pybullet import PyBulletSimulator
+from envs.grasp.vector_env import GraspVectorEnv
+from rewards.plugin import ventosa_rewards
+from rewards.reward import RewardTerm
+from trainers.saving.serialization import flatten, unflatten
+
+SHAPED = ("touch", "collision", "position", "rotation", "approach", "facing")
+SMALL = {"depth": Camera(type="depth", width=32, height=24)}
+BOTH = {**SMALL, "above": Camera(type="rgb", width=20, height=30, fov_deg=50)}
+MODES = pytest.mark.parametrize("frame_grab", [True, False], ids=["frame_grab", "stream"])
+MakeEnv = Callable[..., GraspVectorEnv]
+
+
+def terms(*names: str, weight: float = 1.0) -> list[RewardTerm]:
+    built_in = ventosa_rewards()
+    return [RewardTerm(name, weight, built_in[name](built_in[name].Settings())) for name in names]
+
+
+@pytest.fixture
+def make() -> Iterator[MakeEnv]:
+    environments = []
+
+    def build(
+        num_envs: int = 4,
+        *,
+        rewards: tuple[str, ...] = SHAPED,
+        weight: float = 1.0,
+        seed: int = 0,
+        **settings: Any,
+    ) -> GraspVectorEnv:
+        settings = {"workers": 0, "cameras": SMALL, **settings}
+        env = GraspVectorEnv(
+            GraspSettings(num_envs=num_envs, **settings), terms(*rewards, weight=weight), seed
+        )
+        environments.append(env)
+        return env
+
+    yield build
+    for env in environments:
+        env.close()
+
+
+def perfect(env: GraspVectorEnv, **change: Any) -> np.ndarray:
+    """Actions that bring the cups 15 mm in front of the grasp points, but for `change`."""
+    gap, turn, up = (change.get(name, 0.0) for name in ("gap_m", "turn_rad", "up_m"))
+    scenes = env.scenes
+    yaw = scenes.target_yaw_rad
+    tooltip = scenes.target_m - (0.015 + gap) * heading(yaw) + [0, 0, up]
+    return env.action_for(tooltip, yaw + turn)
+
+
+def still(env: GraspVectorEnv) -> np.ndarray:
+    """Actions that lead nowhere near a block: high up, pulled back."""
+    return np.tile([-1.0, 0.0, 1.0, 0.0], (env.num_envs, 1))
+
+
+def same(first: Any, second: Any) -> None:
+    """Asserts that two nested results are the same, bit for bit."""
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        for key in first:
+            same(first[key], second[key])
+    elif isinstance(first, tuple | list):
+        for one, other in zip(first, second, strict=True):
+            same(one, other)
+    else:
+        assert np.asarray(first).dtype == np.asarray(second).dtype
+        np.testing.assert_array_equal(first, second)
+
+
+def play(env: GraspVectorEnv, steps: int, seed: int) -> list[Any]:
+    """Steps with random actions, of which every third is perfect, so that episodes end."""
+    rng, results = np.random.default_rng(seed), []
+    for step in range(steps):
+        actions = rng.uniform(-1, 1, (env.num_envs, 4))
+        if step % 3 == 2:
+            hit = rng.random(env.num_envs) < 0.5
+            actions[hit] = perfect(env)[hit]
+        results.append(env.step(actions))
+    return results
+
+
+# -- gymnasium's interface -------------------------------------------------------------------------
+
+
+@MODES
+def test_spaces_contain_what_is_delivered(make: MakeEnv, frame_grab: bool) -> None:
+    env = make(5, frame_grab=frame_grab, cameras=BOTH, privileged=True, episode_steps=2)
+    assert isinstance(env, VectorEnv)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    spaces = env.single_observation_space.spaces
+    focal_length_px = 16 / np.tan(np.radians(44.0 / 2))
+    assert spaces["depth"] == DepthImage(24, 32, focal_length_px=focal_length_px)
+    assert isinstance(spaces["above"], RgbImage)
+    assert env.single_action_space == gymnasium.spaces.Box(-1, 1, (4,), np.float32)
+    assert env.action_space.shape == (5, 4)
+    observations, infos = env.reset(seed=0)
+    assert infos == {}
+    shapes = {"depth": (5, 24, 32, 1), "above": (5, 30, 20, 3), "privileged": (5, 22)}
+    for step in range(5):
+        assert {name: value.shape for name, value in observations.items()} == shapes
+        assert env.observation_space.contains(observations), step
+        assert observations["depth"].dtype == np.uint16
+        for row in range(5):
+            one = {name: value[row] for name, value in observations.items()}
+            assert env.single_observation_space.contains(one)
+        assert np.isfinite(observations["privileged"]).all()
+        env.action_space.seed(step)
+        observations, reward, terminated, truncated, infos = env.step(env.action_space.sample())
+        assert reward.shape == terminated.shape == truncated.shape == (5,)
+        assert reward.dtype == np.float64
+        assert terminated.dtype == truncated.dtype == bool
+        assert infos["same_frame"].shape == (5,)
+        for values in (*infos["measures"].values(), *infos["reward_terms"].values()):
+            assert values.shape == (5,)
+
+
+def test_images_lie_in_the_cameras_range(make: MakeEnv) -> None:
+    observations, _ = make(8).reset(seed=0)
+    depth = observations["depth"]
+    assert depth.min() >= 400
+    assert depth.max() <= 2000
+    assert ((depth > 500) & (depth < 1500)).mean() > 0.3  # mostly table and blocks
+    assert (np.abs(depth[0].astype(int) - depth[1].astype(int)) > 10).mean() > 0.05
+
+
+@MODES
+def test_autoreset_happens_in_the_step_an_episode_ends_in(make: MakeEnv, frame_grab: bool) -> None:
+    env = make(6, frame_grab=frame_grab, privileged=True)
+    first, _ = env.reset(seed=1)
+    scenes = env.scenes
+    actions = still(env)
+    done = np.array([True, False, True, False, False, True])
+    actions[done] = perfect(env)[done]
+    observations, _, terminated, truncated, infos = env.step(actions)
+    np.testing.assert_array_equal(terminated, done)
+    assert not truncated.any()
+    np.testing.assert_array_equal(infos["_final_obs"], done)
+    final = infos["final_obs"]
+    assert final.keys() == observations.keys()
+    # Episodes that go on keep their scenes, the others have new ones.
+    moved = (env.scenes.target_m != scenes.target_m).any(axis=1)
+    np.testing.assert_array_equal(moved, done)
+    # The privileged numbers tell before from after: progress is zero at a beginning.
+    tool_before = final["privileged"][:, :3]
+    assert np.abs(tool_before[done] - observations["privileged"][done, :3]).max() > 1.0
+    np.testing.assert_array_equal(final["privileged"][~done], observations["privileged"][~done])
+    np.testing.assert_allclose(observations["privileged"][:, 17], np.where(done, 0.0, 0.1))
+    np.testing.assert_allclose(final["privileged"][:, 17], 0.1)
+    unchanged = (final["depth"] == first["depth"]).all(axis=(1, 2, 3))
+    assert (unchanged == frame_grab).all()
+    assert (final["depth"][done] != observations["depth"][done]).any(axis=(1, 2, 3)).all()
+    np.testing.assert_array_equal(final["depth"][~done], observations["depth"][~done])
+
+
+def test_no_final_observations_while_nothing_ends(make: MakeEnv) -> None:
+    env = make(2)
+    env.reset(seed=0)
+    infos = env.step(still(env))[4]
+    assert "final_obs" not in infos
+    assert "_final_obs" not in infos
+
+
+def test_reset_mask_begins_only_what_it_names(make: MakeEnv) -> None:
+    env = make(4, privileged=True)
+    env.reset(seed=0)
+    before, *_ = env.step(still(env))
+    target = env.scenes.target_m
+    mask = np.array([False, True, True, False])
+    after, _ = env.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal((env.scenes.target_m != target).any(1), mask)
+    np.testing.assert_array_equal((before["depth"] != after["depth"]).any((1, 2, 3)), mask)
+    np.testing.assert_allclose(after["privileged"][:, 17], np.where(mask, 0.0, 0.1))
+    for name in after:
+        np.testing.assert_array_equal(before[name][~mask], after[name][~mask])
+
+
+def test_a_first_reset_begins_everything_whatever_the_mask(make: MakeEnv) -> None:
+    observations, _ = make(3).reset(options={"reset_mask": np.array([True, False, False])})
+    assert (observations["depth"] > 0).any(axis=(1, 2, 3)).all()
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [
+        np.zeros((4, 3)),
+        np.zeros(4),
+        np.zeros((3, 4)),
+        np.full((4, 4), np.nan),
+        np.array([[0, 0, 0, np.inf]] * 4),
+    ],
+    ids=["three numbers", "one row", "three rows", "nan", "inf"],
+)
+def test_actions_that_are_none(make: MakeEnv, actions: np.ndarray) -> None:
+    env = make(4)
+    env.reset(seed=0)
+    before = env.state_dict()
+    with pytest.raises(ValueError, match=r"actions must be finite and of shape \(4, 4\)"):
+        env.step(actions)
+    same(env.state_dict(), before)
+
+
+# -- the task --------------------------------------------------------------------------------------
+
+
+def test_the_perfect_action_succeeds_everywhere_at_once_without_collision(make: MakeEnv) -> None:
+    env = make(64, rewards=("touch", "collision", "position", "rotation"))
+    env.reset(seed=5)
+    for _ in range(5):
+        actions = perfect(env)
+        assert np.abs(actions).max() <= 1.0
+        _, reward, terminated, truncated, infos = env.step(actions)
+        assert terminated.all()
+        assert not truncated.any()
+        np.testing.assert_allclose(reward, 1.0)  # position and rotation
+        measures = infos["measures"]
+        assert measures["success"].all()
+        assert not measures["collision"].any()
+        assert measures["position_error_m"].max() < 1e-9
+        assert measures["yaw_error_deg"].max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("change", "position", "rotation"),
+    [
+        ({}, True, True),
+        ({"gap_m": 0.0045}, True, True),
+        ({"gap_m": 0.006}, False, False),
+        ({"gap_m": -0.006}, False, False),
+        ({"up_m": 0.0095}, True, True),
+        ({"up_m": 0.0105}, False, False),
+        ({"turn_rad": np.radians(1.9)}, True, True),
+        ({"turn_rad": np.radians(-2.1)}, True, False),
+    ],
+    ids=str,
+)
+def test_success_is_judged_by_the_goal_region(
+    make: MakeEnv, change: dict[str, float], position: bool, rotation: bool
+) -> None:
+    env = make(3)
+    env.reset(seed=2)
+    _, _, terminated, _, infos = env.step(perfect(env, **change))
+    assert (infos["reward_terms"]["position"] == (0.5 if position else 0.0)).all()
+    assert (infos["reward_terms"]["rotation"] == (0.5 if rotation else 0.0)).all()
+    assert (terminated == rotation).all()
+    assert (infos["measures"]["success"] == rotation).all()
+    measures = infos["measures"]
+    up, gap = abs(change.get("up_m", 0.0)), abs(change.get("gap_m", 0.0))
+    np.testing.assert_allclose(measures["position_error_y_m"], up, atol=1e-9)
+    np.testing.assert_allclose(measures["position_error_z_m"], gap, atol=1e-9)
+    np.testing.assert_allclose(measures["position_error_m"], max(up, gap), atol=1e-9)
+    turn = np.degrees(abs(change.get("turn_rad", 0.0)))
+    np.testing.assert_allclose(measures["yaw_error_deg"], turn, atol=1e-6)
+
+
+def test_touching_is_paid_once_and_position_is_not_paid_inside_the_block(make: MakeEnv) -> None:
+    env = make(4)
+    env.reset(seed=3)
+    paid = []
+    for gap in (0.06, -0.018, 0.06, -0.018):
+        _, _, terminated, _, infos = env.step(perfect(env, gap_m=gap))
+        assert not terminated.any()
+        paid.append(infos["reward_terms"]["touch"].tolist())
+    assert paid == [[0.0] * 4, [0.1] * 4, [0.0] * 4, [0.0] * 4]
+
+
+def test_collision_is_paid_per_step_and_reported_for_the_episode(make: MakeEnv) -> None:
+    env = make(2)
+    env.reset(seed=0)
+    table = np.tile([0.0, 0.0, -1.0, 0.0], (2, 1))  # the cup's lower half in the table
+    _, _, _, _, infos = env.step(still(env))
+    assert not infos["measures"]["collision"].any()
+    for _ in range(2):
+        _, _, _, _, infos = env.step(table)
+        np.testing.assert_allclose(infos["reward_terms"]["collision"], -0.1)
+        assert infos["measures"]["collision"].all()
+    env.step(still(env))  # out of it
+    _, _, _, _, infos = env.step(still(env))
+    np.testing.assert_allclose(infos["reward_terms"]["collision"], 0.0)
+    assert infos["measures"]["collision"].all()
+
+
+@pytest.mark.parametrize("episode_steps", [1, 4])
+def test_episodes_are_truncated(make: MakeEnv, episode_steps: int) -> None:
+    env = make(3, episode_steps=episode_steps)
+    env.reset(seed=0)
+    for _ in range(2):
+        for step in range(episode_steps):
+            _, _, terminated, truncated, _ = env.step(still(env))
+            assert not terminated.any()
+            assert (truncated == (step == episode_steps - 1)).all()
+
+
+def test_success_in_the_last_step_is_no_truncation(make: MakeEnv) -> None:
+    env = make(2, episode_steps=1)
+    env.reset(seed=0)
+    _, _, terminated, truncated, _ = env.step(perfect(env))
+    assert terminated.all()
+    assert not truncated.any()
+
+
+def test_the_reward_is_the_sum_of_its_weighted_terms(make: MakeEnv) -> None:
+    single, double = make(6, seed=1), make(6, seed=1, weight=2.0)
+    for env in (single, double):
+        env.reset(seed=1)
+    for one, two in zip(play(single, 8, 0), play(double, 8, 0), strict=True):
+        assert set(one[4]["reward_terms"]) == set(SHAPED)
+        total = np.sum([*one[4]["reward_terms"].values()], axis=0)
+        np.testing.assert_allclose(one[1], total)
+        np.testing.assert_allclose(two[1], 2 * one[1])
+        assert np.ptp(one[1]) > 0
+
+
+def test_no_rewards_at_all(make: MakeEnv) -> None:
+    env = make(2, rewards=())
+    env.reset(seed=0)
+    _, reward, _, _, infos = env.step(still(env))
+    np.testing.assert_array_equal(reward, [0.0, 0.0])
+    assert infos["reward_terms"] == {}
+
+
+# -- frames ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def pictures(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Counts, by camera call, how many pictures were taken."""
+    taken: list[int] = []
+    render = PyBulletSimulator.render
+
+    def counted(self: PyBulletSimulator, indices: np.ndarray, views: Any) -> np.ndarray:
+        taken.extend(int(index) for index in indices)
+        return render(self, indices, views)
+
+    monkeypatch.setattr(PyBulletSimulator, "render", counted)
+    return taken
+
+
+def test_frame_grab_takes_exactly_one_picture_per_episode(
+    make: MakeEnv, pictures: list[int]
+) -> None:
+    env = make(4, episode_steps=3)
+    observations, _ = env.reset(seed=0)
+    assert pictures == [0, 1, 2, 3]
+    episodes = 4
+    for step in range(12):
+        del pictures[:]
+        actions = still(env)
+        if step == 4:
+            actions[[0, 2]] = perfect(env)[[0, 2]]
+        before = observations
+        observations, _, terminated, truncated, infos = env.step(actions)
+        done = terminated | truncated
+        episodes += done.sum()
+        assert pictures == np.flatnonzero(done).tolist()
+        np.testing.assert_array_equal(infos["same_frame"], ~done)
+        alike = (observations["depth"] == before["depth"]).all((1, 2, 3))
+        np.testing.assert_array_equal(alike, infos["same_frame"])
+    assert episodes > 4 + 12
+
+
+def test_the_stream_takes_a_picture_at_every_step(make: MakeEnv, pictures: list[int]) -> None:
+    env = make(3, frame_grab=False, episode_steps=3)
+    observations, _ = env.reset(seed=0)
+    for step in range(6):
+        del pictures[:]
+        before = observations
+        observations, _, _, truncated, infos = env.step(still(env))
+        assert pictures == [0, 1, 2] * (2 if step % 3 == 2 else 1)
+        assert truncated.all() == (step % 3 == 2)
+        assert not infos["same_frame"].any()
+        assert (observations["depth"] != before["depth"]).any((1, 2, 3)).all()
+
+
+def test_the_stream_shows_the_robot(make: MakeEnv) -> None:
+    env = make(4, frame_grab=False)
+    first, _ = env.reset(seed=0)
+    # Beside the target and off the table: the arm hides what was farther away.
+    second, *_ = env.step(np.tile([0.0, 0.0, 0.6, 0.0], (4, 1)))
+    nearer = second["depth"].astype(int) < first["depth"].astype(int) - 50
+    assert (nearer.mean((1, 2, 3)) > 0.02).all()
+
+
+@MODES
+def test_observations_handed_out_are_never_written_to_again(
+    make: MakeEnv, frame_grab: bool
+) -> None:
+    env = make(4, frame_grab=frame_grab, cameras=BOTH, privileged=True, episode_steps=3)
+    observations, _ = env.reset(seed=0)
+    handed = [(observations, {name: value.copy() for name, value in observations.items()})]
+    for _, _, _, _, infos in [result := env.step(still(env)) for _ in range(7)]:
+        for seen in (result[0], infos.get("final_obs", {})):
+            handed.append((seen, {name: value.copy() for name, value in seen.items()}))
+    state = env.state_dict()
+    kept = unflatten(*(json.loads(json.dumps(flatten(state)[0])), _copied(flatten(state)[1])))
+    env.reset(options={"reset_mask": np.array([True, False, False, True])})
+    play(env, 6, 0)
+    for seen, copy in handed:
+        same(seen, copy)
+    same(state, kept)
+
+
+def _copied(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: array.copy() for name, array in arrays.items()}
+
+
+# -- parameters ------------------------------------------------------------------------------------
+
+
+def test_parameters_hold_from_the_next_reset_on(make: MakeEnv) -> None:
+    env = make(3, privileged=True)
+    env.reset(seed=0)
+    env.set_parameters({"vertical_limit_m": 0.1, "gap_limit_m": 0.12, "yaw_limit_deg": 10.0})
+    far = {"up_m": 0.02, "gap_m": 0.05}
+    observations, _, terminated, _, _ = env.step(perfect(env, **far))
+    assert not terminated.any()
+    np.testing.assert_allclose(observations["privileged"][0, 13:16], [0.1, 0.1, 0.2], rtol=1e-6)
+    mask = np.array([True, False, False])
+    observations, _ = env.reset(options={"reset_mask": mask})
+    np.testing.assert_allclose(observations["privileged"][0, 13:16], [0.1, 1.0, 1.2], rtol=1e-6)
+    _, _, terminated, _, infos = env.step(perfect(env, **far))
+    np.testing.assert_array_equal(terminated, mask)
+    # Errors are reported against the last lesson's region all the same.
+    np.testing.assert_allclose(infos["measures"]["position_error_y_m"], 0.02)
+
+
+def test_parameters_replace_those_set_before(make: MakeEnv) -> None:
+    env = make(2, privileged=True)
+    env.set_parameters({"lateral_limit_m": 0.1})
+    env.set_parameters({"vertical_limit_m": 0.1})
+    observations, _ = env.reset(seed=0)
+    np.testing.assert_allclose(observations["privileged"][0, 13:15], [0.1, 1.0], rtol=1e-6)
+
+
+def test_parameters_may_be_drawn_at_every_reset(make: MakeEnv) -> None:
+    env = make(64, privileged=True)
+    sampler = UniformSampler(
+        sampler_type="uniform",
+        sampler_parameters=UniformParameters(min_value=0.02, max_value=0.08),
+    )
+    env.set_parameters({"lateral_limit_m": sampler})
+    first, _ = env.reset(seed=0)
+    second, _ = env.reset()
+    limits = first["privileged"][:, 13] / 10
+    assert 0.02 <= limits.min() < 0.025
+    assert 0.075 < limits.max() <= 0.08
+    assert (second["privileged"][:, 13] != first["privileged"][:, 13]).all()
+
+
+def test_the_blocks_yaw_limit_is_a_parameter(make: MakeEnv) -> None:
+    env = make(16)
+    env.set_parameters({"block_yaw_limit_deg": 3.0})
+    env.reset(seed=0)
+    yaw = np.degrees(np.abs(env.scenes.block_yaw_rad))
+    assert 2.0 < yaw.max() <= 3.0
+
+
+def test_the_sensors_noise_is_a_parameter(make: MakeEnv) -> None:
+    deviations = {}
+    for sigma in (0.0, 0.02):
+        env = make(4, frame_grab=False, seed=0)
+        env.set_parameters({"noise_sigma_m": sigma})
+        first, _ = env.reset(seed=0)
+        first, *_ = env.step(still(env))
+        second, *_ = env.step(still(env))  # the same picture, but for the noise
+        difference = first["depth"].astype(float) - second["depth"]
+        inside = (first["depth"] > 500) & (first["depth"] < 1800)
+        deviations[sigma] = difference[inside].std()
+    assert deviations[0.0] == 0.0
+    assert deviations[0.02] == pytest.approx(20 * np.sqrt(2), rel=0.05)
+
+
+def test_a_drawn_noise_is_never_negative(make: MakeEnv) -> None:
+    env = make(32)
+    env.set_parameters(
+        {
+            "noise_sigma_m": GaussianSampler(
+                sampler_type="gaussian",
+                sampler_parameters=GaussianParameters(mean=0.0, st_dev=0.01),
+            )
+        }
+    )
+    env.reset(seed=0)
+    sigma = env.state_dict()["views"]["depth"]["noise_sigma_m"]
+    assert sigma.min() == 0.0
+    assert 8 <= (sigma > 0).sum() <= 24
+
+
+def test_unknown_parameters_are_named(make: MakeEnv) -> None:
+    with pytest.raises(ValueError, match=r"\['block_yaw'\].*block_yaw_limit_deg.*yaw_limit_deg"):
+        make(1).set_parameters({"block_yaw": 1.0, "yaw_limit_deg": 2.0})
+
+
+# -- the same again --------------------------------------------------------------------------------
+
+
+@MODES
+def test_same_seed_same_rollout_other_seed_another(make: MakeEnv, frame_grab: bool) -> None:
+    results = []
+    for construction, seed in ((0, 7), (1, 7), (0, 8)):
+        env = make(4, seed=construction, frame_grab=frame_grab, cameras=BOTH, privileged=True)
+        results.append([env.reset(seed=seed), *play(env, 8, 0)])
+    same(results[0], results[1])
+    first, other = (result[0][0] for result in (results[0], results[2]))
+    for name in first:
+        assert (first[name] != other[name]).any(axis=tuple(range(1, first[name].ndim))).all()
+
+
+def test_the_constructors_seed_counts_until_a_reset_gives_one(make: MakeEnv) -> None:
+    one, two, three = make(2, seed=4), make(2, seed=4), make(2, seed=5)
+    first, second, third = (env.reset()[0]["depth"] for env in (one, two, three))
+    np.testing.assert_array_equal(first, second)
+    assert (first != third).any()
+    assert (one.reset()[0]["depth"] != first).any()  # goes on, does not begin anew
+
+
+def test_an_episode_does_not_depend_on_the_workers(make: MakeEnv) -> None:
+    results = []
+    for workers in (0, 2):
+        env = make(5, workers=workers, cameras=BOTH, frame_grab=False)
+        results.append([env.reset(seed=3), *play(env, 5, 1)])
+    same(results[0], results[1])
+
+
+@MODES
+def test_a_saved_state_has_the_same_future_bit_for_bit(make: MakeEnv, frame_grab: bool) -> None:
+    options = {
+        "frame_grab": frame_grab,
+        "cameras": BOTH,
+        "privileged": True,
+        "episode_steps": 4,
+    }
+    parameters = {
+        "lateral_limit_m": UniformSampler(
+            sampler_type="uniform",
+            sampler_parameters=UniformParameters(min_value=0.01, max_value=0.1),
+        ),
+        "noise_sigma_m": 0.004,
+    }
+    env = make(6, **options)
+    env.set_parameters(parameters)
+    env.reset(seed=0)
+    last = play(env, 5, 0)[-1][0]
+    skeleton, arrays = flatten(env.state_dict())
+    text, arrays = json.dumps(skeleton, allow_nan=False), _copied(arrays)
+    expected = play(env, 9, 1)
+    assert any((result[2] | result[3]).any() for result in expected)
+
+    resumed = make(6, seed=99, **options)
+    resumed.set_parameters(parameters)
+    same(resumed.load_state_dict(unflatten(json.loads(text), arrays)), last)
+    same(play(resumed, 9, 1), expected)
+    same(flatten(resumed.state_dict())[1], flatten(env.state_dict())[1])
+
+
+def test_a_state_can_be_gone_back_to_in_the_same_environment(make: MakeEnv) -> None:
+    env = make(3, frame_grab=False)
+    env.reset(seed=0)
+    play(env, 2, 0)
+    state = env.state_dict()
+    expected = play(env, 6, 1)
+    env.load_state_dict(state)
+    same(play(env, 6, 1), expected)
+
+
+def test_the_robots_stand_where_the_state_has_them() -> None:
+    settings = GraspSettings(num_envs=2, workers=0, cameras=SMALL)
+    env = GraspVectorEnv(settings, [], render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(np.zeros((2, 4)))
+    state, expected = env.state_dict(), env.render()
+    env.reset()
+    env.load_state_dict(state)
+    same(env.render(), expected)
+    env.close()
+
+
+# -- privileged ------------------------------------------------------------------------------------
+
+
+def test_privileged_numbers_are_the_true_state(make: MakeEnv) -> None:
+    env = make(4, privileged=True, episode_steps=5)
+    observations, _ = env.reset(seed=0)
+    scenes, middle = env.scenes, np.array([1.05, 0.0, 0.75])
+    numbers = observations["privileged"]
+    np.testing.assert_allclose(numbers[:, 5:8] / 10 + middle, scenes.target_m, atol=1e-6)
+    np.testing.assert_allclose(numbers[:, 8], np.sin(scenes.target_yaw_rad), atol=1e-6)
+    assert (numbers[:, 18] == 1).all()  # nothing done yet
+    assert (numbers[:, [17, 19, 20, 21]] == 0).all()
+    observations, *_ = env.step(perfect(env, gap_m=0.04, turn_rad=0.05))
+    numbers = observations["privileged"]
+    yaw = scenes.target_yaw_rad
+    expected = scenes.target_m - 0.055 * heading(yaw)
+    np.testing.assert_allclose(numbers[:, :3] / 10 + middle, expected, atol=1e-6)
+    np.testing.assert_allclose(numbers[:, 3], np.sin(yaw + 0.05), atol=1e-6)
+    np.testing.assert_allclose(numbers[:, 4], 0.0, atol=1e-6)  # the tool is level
+    np.testing.assert_allclose(numbers[:, 9:12] / 10, -0.055 * heading(yaw), atol=1e-6)
+    np.testing.assert_allclose(numbers[:, 12], np.sin(0.05), atol=1e-6)
+    np.testing.assert_allclose(
+        numbers[:, 13:17], np.tile([0.1, 0.1, 0.2, np.radians(2.0) * 10], (4, 1)), rtol=1e-6
+    )
+    np.testing.assert_allclose(numbers[:, 17], 0.2)
+    assert (numbers[:, 18:] == 0).all()
+    observations, *_ = env.step(perfect(env, turn_rad=0.05))  # in place, but turned
+    assert (observations["privileged"][:, 20] == 1).all()
+    assert (observations["privileged"][:, 21] == 0).all()
+
+
+def test_privileged_numbers_are_not_offered_unasked(make: MakeEnv) -> None:
+    env = make(1)
+    assert set(env.single_observation_space.spaces) == {"depth"}
+    assert set(env.reset(seed=0)[0]) == {"depth"}
