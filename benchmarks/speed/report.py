@@ -1,4 +1,4 @@
-"""What a run of `benchmarks.throughput` found, and where."""
+"""what a run of `benchmarks.speed` found, and where."""
 
 from __future__ import annotations
 

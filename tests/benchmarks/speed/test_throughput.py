@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import throughput
+from benchmarks.speed import __main__ as throughput
 from benchmarks.speed import training
 from benchmarks.speed.figures import OURS
 from benchmarks.speed.processes import first_step_time_s, footprints

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict
 
-from benchmarks.contest.cases import CASES, Case
-from benchmarks.contest.evaluation import Referee, returns
+from benchmarks.learning.cases import CASES, Case
+from benchmarks.learning.evaluation import Referee, returns
 from envs.environment import Environment
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("scipy")
 
-from benchmarks.contest.report import draw, half_interval, summaries, write_page
+from benchmarks.learning.report import draw, half_interval, summaries, write_page
 
 LENGTHS = (2, 3)
 
@@ -129,7 +129,7 @@ def test_every_case_has_a_run_file(case: Case) -> None:
 def test_the_peers_side_learns(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3")
     pytest.importorskip("sb3_contrib")
-    from benchmarks.contest.theirs import learn
+    from benchmarks.learning.theirs import learn
     from trainers.runfile.registry import load_registries
     from trainers.runfile.settings import load_run
     from trainers.session import build_environment

@@ -1,4 +1,4 @@
-"""What came out of the contest: a table, a page, and learning curves."""
+"""What came out: a table, a page, and learning curves."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 from scipy.special import stdtrit
 
-from benchmarks.contest.cases import OURS, PEER, PEER_NAMES, SIDES
+from benchmarks.learning.cases import OURS, PEER, PEER_NAMES, SIDES
 from benchmarks.page import markdown, write_between
 
 HEAD = ("task", "steps", "algorithm", "seeds", "ventosa", "peer", "ventosa steps/s", "peer's")

@@ -1,4 +1,4 @@
-"""How fast everything is, side by side with its peers: `python -m benchmarks.throughput`.
+"""How fast everything is, side by side with its peers: `python -m benchmarks.speed`.
 
 Simulators and environments are compared with PyBullet's, the training loop with Stable-Baselines3's
 PPO on the same environment. All are measured in turn in one run: the median over the rounds counts,
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Reads the command line."""
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.throughput",
+        prog="python -m benchmarks.speed",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

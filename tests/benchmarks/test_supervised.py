@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import fit
+from benchmarks import supervised as fit
 from envs.grasp.settings import GraspSettings
 from envs.grasp.vector_env import GraspVectorEnv
 from trainers.runfile.registry import load_registries

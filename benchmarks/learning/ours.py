@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.contest.evaluation import Act, Referee
+from benchmarks.learning.evaluation import Act, Referee
 from trainers.networks.actor_critic import to_environment
 from trainers.networks.observations import to_tensors
 from trainers.runfile.registry import Registries

@@ -1,4 +1,4 @@
-"""One run of one side, in a process of its own: `python -m benchmarks.contest.run`."""
+"""One run of one side, in a process of its own: `python -m benchmarks.learning.run`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from benchmarks.contest import ours, theirs
-from benchmarks.contest.cases import OURS, PEER, SIDES, Case, Entry
-from benchmarks.contest.evaluation import Referee, returns
+from benchmarks.learning import ours, theirs
+from benchmarks.learning.cases import OURS, PEER, SIDES, Case, Entry
+from benchmarks.learning.evaluation import Referee, returns
 from trainers.common.files import write_atomically
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import load_run
@@ -24,7 +24,7 @@ LEARNERS = {OURS: ours.learn, PEER: theirs.learn}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Learns, evaluates, and writes what came out."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.contest.run", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.learning.run", description=__doc__)
     parser.add_argument("algorithm")
     parser.add_argument("task")
     parser.add_argument("steps", type=int)

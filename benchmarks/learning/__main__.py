@@ -17,9 +17,9 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks.contest.cases import CASES, SIDES, Entry
-from benchmarks.contest.report import draw, summaries, table, write_page
 from benchmarks.jobs import Job, run_missing
+from benchmarks.learning.cases import CASES, SIDES, Entry
+from benchmarks.learning.report import draw, summaries, table, write_page
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -74,7 +74,7 @@ def report(options: argparse.Namespace, entries: Sequence[Entry]) -> int:
 def _job(entry: Entry, results: Path) -> Job:
     """One run of one side, in a process of its own."""
     case, file = entry.case, results.resolve() / f"{entry.name}.json"
-    command = ["-m", "benchmarks.contest.run", case.algorithm, case.task, str(case.steps)]
+    command = ["-m", "benchmarks.learning.run", case.algorithm, case.task, str(case.steps)]
     command += [entry.side, str(entry.seed), "--to", str(file)]
     return Job(entry.name, [command], file)
 

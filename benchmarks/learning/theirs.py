@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from benchmarks.contest.evaluation import Act, Referee
+from benchmarks.learning.evaluation import Act, Referee
 from benchmarks.peers import PeerVecEnv
 from trainers.algorithms.ddpg import DDPGSettings
 from trainers.algorithms.ppo import PPOSettings

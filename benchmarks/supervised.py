@@ -1,6 +1,6 @@
 """How much of the pose a network can tell from an image: a fit by supervision.
 
-    python -m benchmarks.fit config/run.yaml [KEY=VALUE ...] [--minutes 3] [--learning-rate 3e-3]
+    python -m benchmarks.supervised config/run.yaml [KEY=VALUE ...] [--minutes 3]
 
 The run's policy is shown fresh scenes with the right action in each: no reward, no exploration.
 What it reaches bounds what reinforcement learning can hope for with the same images and the same
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Reads the command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.fit", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.supervised", description=__doc__)
     parser.add_argument("config", type=Path, help="a run file with `environment: {type: grasp}`")
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
     parser.add_argument("--minutes", type=float, default=3.0)
