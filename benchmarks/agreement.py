@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from envs.grasp.scene.sampler import Scenes, SceneSampler
-from envs.grasp.sensors.camera import Views
+from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Camera, GraspSettings, Support
 from envs.grasp.simulators.base import Contacts, Simulator
 from envs.grasp.simulators.fast import FastSimulator
@@ -176,7 +176,7 @@ def photographs(make: Callable[[int, Support], Simulator], sample: Sample) -> tu
         simulator.load(sample.everywhere, sample.scenes, sample.start.joints_rad)
         depth = simulator.render(sample.everywhere, sample.views["depth"])
         # Where the depth camera stands, so that their pixels show the same.
-        views = Views(sample.views["rgb"].camera, **sample.views["depth"].arrays())
+        views = CameraPoses(sample.views["rgb"].camera, **sample.views["depth"].arrays())
         return depth, simulator.render(sample.everywhere, views)
     finally:
         simulator.close()

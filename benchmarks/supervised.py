@@ -126,15 +126,15 @@ def judge(policy: Policy, env: GraspVectorEnv) -> dict[str, str]:
     parts: list[dict[str, NDArray[Any]]] = []
     for _ in range(-(-JUDGED // env.num_envs)):
         actions = to_environment(_actions(policy, env), env.single_action_space)
-        parts.append(env.step_without_reset(actions)[-1]["measures"])
-    measures = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        parts.append(env.step_without_reset(actions)[-1]["episode_metrics"])
+    episode_metrics = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def spread(name: str, factor: float = 1.0) -> str:
-        median, late = np.percentile(measures[name] * factor, [50, 95])
+        median, late = np.percentile(episode_metrics[name] * factor, [50, 95])
         return f"{median:.1f} / {late:.1f}"
 
     return {
-        "success": f"{measures['success'].mean():.1%}",
+        "success": f"{episode_metrics['success'].mean():.1%}",
         "position mm": spread("position_error_m", 1000.0),
         "yaw deg": spread("yaw_error_deg"),
     }

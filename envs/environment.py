@@ -38,7 +38,7 @@ class PhysicalCheck(Protocol):
         """Frees what it holds; calling it twice does no harm."""
 
 
-class Album(Protocol):
+class EvaluationReport(Protocol):
     """Pictures of a policy's actions, for people to look at.
 
     Attributes:
@@ -69,8 +69,8 @@ class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     - `same_frame` (N,): the images of the observation are those of the step before, so that they
       need be neither stored nor encoded again.
     - `reward_terms`: the weighted rewards (N,) by name.
-    - `measures`: by name, what to report of an episode (N,), read where it ends. `success` among
-      them is the success rate.
+    - `episode_metrics`: by name, what to report of an episode (N,), read where it ends. `success`
+      among them is the success rate.
 
     Arrays that were handed out, observations above all, are not written to afterwards.
 
@@ -123,7 +123,7 @@ class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         """
         raise ValueError("it has no physical check")
 
-    def album(self) -> Album:
+    def album(self) -> EvaluationReport:
         """What evaluation has its pictures from; an environment need not have it.
 
         Raises:

@@ -7,13 +7,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rewards.grasp.transition import Transition
+from rewards.grasp.transition import GraspTransition
 
 
 class Reward(Protocol):
     """A term of the reward, built from its ``Settings``; the environment applies its weight."""
 
-    def __call__(self, transition: Transition) -> NDArray[np.float64]:
+    def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
         """Return the unweighted rewards, of shape (N,), of one step of N environments."""
         ...
 
@@ -27,7 +27,9 @@ class RewardTerm:
     reward: Reward
 
 
-def weigh(terms: Sequence[RewardTerm], transition: Transition) -> dict[str, NDArray[np.float64]]:
+def weigh(
+    terms: Sequence[RewardTerm], transition: GraspTransition
+) -> dict[str, NDArray[np.float64]]:
     """Compute the weighted rewards (N,) of one step, by name.
 
     Raises:

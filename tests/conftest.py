@@ -92,7 +92,7 @@ class ToyEnvironment(Environment):
         truncated = self._steps >= self._settings.episode_steps
         infos: dict[str, Any] = {
             "reward_terms": {"near": -distance},
-            "measures": {"success": distance < 0.1, "distance_m": distance},
+            "episode_metrics": {"success": distance < 0.1, "distance_m": distance},
             "same_frame": ~truncated,
         }
         observations = self._observations()
@@ -213,7 +213,7 @@ class ScriptedEnvironment(Environment):
         final: by name, (T, N, ...): what an ended episode showed last; required where one ends.
         same_frame: (T, N); absent from the infos by default, as are the two that follow.
         terms: by name, (T, N).
-        measures: by name, (T, N).
+        episode_metrics: by name, (T, N).
     """
 
     def __init__(
@@ -227,7 +227,7 @@ class ScriptedEnvironment(Environment):
         final: Mapping[str, Any] | None = None,
         same_frame: Any = None,
         terms: Mapping[str, Any] | None = None,
-        measures: Mapping[str, Any] | None = None,
+        episode_metrics: Mapping[str, Any] | None = None,
     ):
         self.reward = np.asarray(reward, np.float64)
         self.num_envs = self.reward.shape[1]
@@ -240,7 +240,7 @@ class ScriptedEnvironment(Environment):
         self.final = {name: np.asarray(v, space[name].dtype) for name, v in (final or {}).items()}
         self.same_frame = same_frame
         self.terms = {name: np.asarray(v, np.float64) for name, v in (terms or {}).items()}
-        self.measures = {name: np.asarray(v) for name, v in (measures or {}).items()}
+        self.episode_metrics = {name: np.asarray(v) for name, v in (episode_metrics or {}).items()}
         self.actions_taken: list[np.ndarray] = []
         self.time = 0
 
@@ -255,8 +255,10 @@ class ScriptedEnvironment(Environment):
         infos: dict[str, Any] = {}
         if self.terms:
             infos["reward_terms"] = {name: values[t] for name, values in self.terms.items()}
-        if self.measures:
-            infos["measures"] = {name: values[t] for name, values in self.measures.items()}
+        if self.episode_metrics:
+            infos["episode_metrics"] = {
+                name: values[t] for name, values in self.episode_metrics.items()
+            }
         if self.same_frame is not None:
             infos["same_frame"] = np.asarray(self.same_frame, bool)[t]
         if done.any():

@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 from torch import nn
 
 from curricula.samplers import ParameterValue
-from envs.environment import Album, Environment, PhysicalCheck
+from envs.environment import Environment, EvaluationReport, PhysicalCheck
 from trainers.algorithms.base import Algorithm
 from trainers.common.errors import UserError
-from trainers.experience.env_runner import SUCCESS, Episodes, Interaction, Step, concatenate
+from trainers.experience.env_runner import SUCCESS, EnvRunner, EpisodeBatch, Step, concatenate
 from trainers.networks.actor_critic import to_environment
 from trainers.networks.observations import to_tensors
 from trainers.networks.recurrent import Sequences
 from trainers.runfile.registry import Registries, load_registries
 from trainers.runfile.settings import RunSettings, load_run
 from trainers.saving.checkpoint import Loaded
-from trainers.saving.evaluation_folder import EVALUATION, Gallery
+from trainers.saving.evaluation_folder import EVALUATION, EvaluationFolder
 from trainers.saving.run_folder import CONFIGURATION, find_checkpoint, run_folder
 from trainers.session import build_curriculum, build_environment, build_factory
 
@@ -81,7 +81,7 @@ def evaluate(
 
     playing = partial(_player, run, registries, loaded, seed)
     with playing(FIRST_ACTION) as player, ExitStack() as stack:
-        env, check, album, gallery = player.interaction.env, None, None, None
+        env, check, album, gallery = player.env_runner.env, None, None, None
         count = episodes or env.evaluation_episodes
         if pick:
             with _asked_for("--pick"):
@@ -89,7 +89,9 @@ def evaluate(
         if render is not None:
             with _asked_for("--render"):
                 album = env.album()
-            gallery = Gallery(Path(render) if render else folder / EVALUATION, album.file_names)
+            gallery = EvaluationFolder(
+                Path(render) if render else folder / EVALUATION, album.file_names
+            )
         first = _first_actions(player, count, check, album)
     with playing(WHOLE_EPISODE) as player:
         whole = _whole_episodes(player, count, deterministic=not first)
@@ -134,12 +136,12 @@ class _Player:
     """A policy before its environments."""
 
     def __init__(self, run: RunSettings, registries: Registries, env: Environment, seed: int):
-        self.interaction = Interaction(env)
+        self.env_runner = EnvRunner(env)
         self._generator = torch.Generator().manual_seed(seed)
         self._algorithm: Algorithm = run.trainer.cls(
             build_factory(run, registries, env),
             run.trainer.settings,
-            self.interaction,
+            self.env_runner,
             self._generator,
             torch.device("cpu"),
         )
@@ -155,15 +157,15 @@ class _Player:
 
     def reset(self) -> None:
         """Begins an episode everywhere."""
-        self.interaction.reset()
-        self._remembered = self._algorithm.initial_state(self.interaction.env.num_envs)
+        self.env_runner.reset()
+        self._remembered = self._algorithm.initial_state(self.env_runner.env.num_envs)
 
     @torch.no_grad()
     def actions(self, *, deterministic: bool) -> NDArray[Any]:
         """Actions for the present observations."""
-        env = self.interaction.env
+        env = self.env_runner.env
         space = env.single_observation_space
-        observations = to_tensors(self.interaction.observations, space, torch.device("cpu"))
+        observations = to_tensors(self.env_runner.observations, space, torch.device("cpu"))
         actions, self._remembered = self._algorithm.act(
             replace(observations, sequences=Sequences.single(self._remembered)),
             deterministic=deterministic,
@@ -172,7 +174,7 @@ class _Player:
 
     def step(self, *, deterministic: bool) -> Step:
         """Acts once everywhere; where an episode ends, it is forgotten."""
-        step = self.interaction.step(self.actions(deterministic=deterministic))
+        step = self.env_runner.step(self.actions(deterministic=deterministic))
         self._remembered[torch.from_numpy(step.done)] = 0.0
         return step
 
@@ -182,19 +184,19 @@ def _whole_episodes(player: _Player, episodes: int, *, deterministic: bool) -> d
 
     Shares, because the first episodes to end would be the short ones, not like the others.
     """
-    interaction = player.interaction
-    count = interaction.env.num_envs
+    env_runner = player.env_runner
+    count = env_runner.env.num_envs
     share = np.full(count, episodes // count) + (np.arange(count) < episodes % count)
-    parts: list[Episodes] = []
+    parts: list[EpisodeBatch] = []
     ended = np.zeros(count, np.int64)
     player.reset()
     while (ended < share).any():
         done = np.flatnonzero(player.step(deterministic=deterministic).done)
-        finished = interaction.take_finished()
+        finished = env_runner.pop_finished()
         parts.append(finished[ended[done] < share[done]])
         ended[done] += 1
     played = concatenate(parts)
-    shares = _means(played.measures)
+    shares = _means(played.episode_metrics)
     rates = {"success": SUCCESS, "collision_rate": COLLISION}
     return {
         **{key: shares[name] for key, name in rates.items() if name in shares},
@@ -205,11 +207,11 @@ def _whole_episodes(player: _Player, episodes: int, *, deterministic: bool) -> d
 
 
 def _first_actions(
-    player: _Player, episodes: int, check: PhysicalCheck | None, album: Album | None
+    player: _Player, episodes: int, check: PhysicalCheck | None, album: EvaluationReport | None
 ) -> dict[str, Any]:
     """Takes the deterministic policy's first action in every scene."""
-    env = player.interaction.env
-    measures: list[dict[str, NDArray[Any]]] = []
+    env = player.env_runner.env
+    episode_metrics: list[dict[str, NDArray[Any]]] = []
     outcomes: list[dict[str, NDArray[Any]]] = []
     for begin in range(0, episodes, env.num_envs):
         player.reset()
@@ -220,25 +222,28 @@ def _first_actions(
         if album is not None:
             album.add(asked_for, outcomes[-1])
         *_, infos = env.step(actions)
-        measures.append(infos.get("measures", {}))
-        if POSITION_ERROR not in measures[-1]:
+        episode_metrics.append(infos.get("episode_metrics", {}))
+        if POSITION_ERROR not in episode_metrics[-1]:
             return {}  # it is not the first action that counts here
-    return {**_errors(_joined(measures, episodes)), **_picks(_joined(outcomes, episodes))}
+    return {**_errors(_joined(episode_metrics, episodes)), **_picks(_joined(outcomes, episodes))}
 
 
 def _joined(parts: Sequence[dict[str, NDArray[Any]]], rows: int) -> dict[str, NDArray[Any]]:
     return {name: np.concatenate([part[name] for part in parts])[:rows] for name in parts[0]}
 
 
-def _errors(measures: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+def _errors(episode_metrics: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     return {
-        "first_action_success": float(measures[SUCCESS].mean()),
-        "first_action_collision_rate": float(measures[COLLISION].mean()),
+        "first_action_success": float(episode_metrics[SUCCESS].mean()),
+        "first_action_collision_rate": float(episode_metrics[COLLISION].mean()),
         "position_error_m": {
-            **_median_and_p95(measures[POSITION_ERROR]),
-            **{axis: float(np.median(measures[f"position_error_{axis}_m"])) for axis in "xyz"},
+            **_median_and_p95(episode_metrics[POSITION_ERROR]),
+            **{
+                axis: float(np.median(episode_metrics[f"position_error_{axis}_m"]))
+                for axis in "xyz"
+            },
         },
-        "yaw_error_deg": _median_and_p95(measures["yaw_error_deg"]),
+        "yaw_error_deg": _median_and_p95(episode_metrics["yaw_error_deg"]),
     }
 
 

@@ -33,7 +33,7 @@ def ventosa_encoders() -> dict[str, type]:  # type: ignore[empty-body]
 def ventosa_rewards() -> dict[str, type]:  # type: ignore[empty-body]
     """Offer rewards: name -> class whose instances are callable.
 
-    It is built as `cls(settings)`, and maps a `rewards.grasp.transition.Transition` of N
+    It is built as `cls(settings)`, and maps a `rewards.grasp.transition.GraspTransition` of N
     environments to an array (N,) of floats. The environment applies the run file's weight.
     """
 

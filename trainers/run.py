@@ -15,7 +15,7 @@ from trainers.common.timers import Timer, recording
 from trainers.experience.env_runner import NonFiniteError
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.summary import Summary
-from trainers.reporting.terminal import Progress, make_progress
+from trainers.reporting.terminal import TerminalDisplay, make_display
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import dump_yaml, load_run
 from trainers.saving.checkpoint import Checkpoints, Loaded
@@ -53,10 +53,10 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
         # Nothing is replaced before it is certain that the run can begin.
         resumed = _start(session, options, checkpoints)
         begin(directory, run, resume=options.resume)
-        start = session.interaction.step_count
+        start = session.env_runner.step_count
         with (
             closing(RunLog(directory, start if resumed else None)) as log,
-            make_progress(run_id, settings.max_steps, session.lesson_count, start) as progress,
+            make_display(run_id, settings.max_steps, session.lesson_count, start) as progress,
             _timers_written(directory),
         ):
             log.text("configuration", f"```yaml\n{dump_yaml(run)}```", start)
@@ -82,7 +82,7 @@ def _train(
     settings: TrainerSettings,
     summary: Summary,
     checkpoints: Checkpoints,
-    progress: Progress,
+    progress: TerminalDisplay,
 ) -> bool:
     """Trains, and leaves the run's state in status.json however it ends."""
     state = "failed"

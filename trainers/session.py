@@ -15,7 +15,7 @@ from envs.environment import Environment
 from rewards.reward import RewardTerm
 from trainers.algorithms.base import Algorithm
 from trainers.common.errors import UserError
-from trainers.experience.env_runner import Episodes, Interaction
+from trainers.experience.env_runner import EnvRunner, EpisodeBatch
 from trainers.networks.network import (
     DEFAULT_IMAGE_ENCODER,
     DEFAULT_VECTOR_ENCODER,
@@ -36,7 +36,7 @@ class Session:
         stop_requested: asked before every step of the environments.
 
     Attributes:
-        interaction: the environments.
+        env_runner: the environments.
         algorithm: learns from them.
         curriculum: None where the run has none.
 
@@ -61,10 +61,10 @@ class Session:
             self._check_parameters(env)
             torch.manual_seed(run.seed)
             generator = torch.Generator(device).manual_seed(run.seed)
-            self.interaction = Interaction(env, stop_requested)
+            self.env_runner = EnvRunner(env, stop_requested)
             factory = build_factory(run, registries, env)
             self.algorithm: Algorithm = run.trainer.cls(
-                factory, run.trainer.settings, self.interaction, generator, device
+                factory, run.trainer.settings, self.env_runner, generator, device
             )
         except BaseException:
             env.close()
@@ -83,9 +83,9 @@ class Session:
 
     def reset(self) -> None:
         """Begins the run's first episodes."""
-        self.interaction.reset()
+        self.env_runner.reset()
 
-    def advance_curriculum(self, episodes: Episodes, progress: float) -> bool:
+    def advance_curriculum(self, episodes: EpisodeBatch, progress: float) -> bool:
         """Shows finished episodes to the curriculum; True if a new lesson begins."""
         if self.curriculum is None:
             return False
@@ -94,7 +94,7 @@ class Session:
         self._curriculum_state = self.curriculum.advance(self._curriculum_state, finished)
         if self.lesson == before:
             return False
-        self.interaction.env.set_parameters(self._parameters_now())
+        self.env_runner.env.set_parameters(self._parameters_now())
         return True
 
     def weights(self) -> dict[str, Tensor]:
@@ -105,7 +105,7 @@ class Session:
         """Everything but the weights; taken between an update and the next collection."""
         return {
             "algorithm": self.algorithm.state_dict(),
-            "interaction": self.interaction.state_dict(),
+            "interaction": self.env_runner.state_dict(),
             "curriculum": self._curriculum_state,
         }
 
@@ -114,12 +114,12 @@ class Session:
         self.algorithm.load_state_dict(weights, state["algorithm"])
         if self.curriculum is not None:
             self._curriculum_state = state["curriculum"]
-        self.interaction.env.set_parameters(self._parameters_now())
-        self.interaction.load_state_dict(state["interaction"])
+        self.env_runner.env.set_parameters(self._parameters_now())
+        self.env_runner.load_state_dict(state["interaction"])
 
     def close(self) -> None:
         """Ends the environments."""
-        self.interaction.env.close()
+        self.env_runner.env.close()
 
     def _parameters_now(self) -> dict[str, ParameterValue]:
         lesson = (

@@ -10,7 +10,7 @@ from trainers.algorithms.base import TrainerSettings
 from trainers.common.timers import timed
 from trainers.experience.env_runner import StopRequested
 from trainers.reporting.summary import Summary
-from trainers.reporting.terminal import Progress
+from trainers.reporting.terminal import TerminalDisplay
 from trainers.saving.checkpoint import Checkpoints
 from trainers.session import Session
 
@@ -20,7 +20,7 @@ def train(
     settings: TrainerSettings,
     summary: Summary,
     checkpoints: Checkpoints,
-    progress: Progress,
+    progress: TerminalDisplay,
 ) -> bool:
     """Trains until the steps are used up or a stop is requested; what was learned is saved.
 
@@ -31,12 +31,12 @@ def train(
         EnvironmentFailure: an environment broke down; the run is saved as of the last update.
         NonFiniteError: a reward, an observation or a loss is not finite; nothing new is saved.
     """
-    interaction, algorithm = session.interaction, session.algorithm
+    env_runner, algorithm = session.env_runner, session.algorithm
     max_steps = settings.max_steps
-    saved_at = interaction.step_count
-    while interaction.step_count < max_steps:
+    saved_at = env_runner.step_count
+    while env_runner.step_count < max_steps:
         # Between an update and the next collection is where a run can be taken up again.
-        step, boundary = interaction.step_count, session.state_dict()
+        step, boundary = env_runner.step_count, session.state_dict()
         try:
             with timed("collect"):
                 algorithm.collect()
@@ -47,20 +47,20 @@ def train(
             raise
         with timed("update"):
             summary.add(algorithm.update(step / max_steps))
-        episodes = interaction.take_finished()
+        episodes = env_runner.pop_finished()
         summary.add_episodes(episodes)
-        if session.advance_curriculum(episodes, interaction.step_count / max_steps):
+        if session.advance_curriculum(episodes, env_runner.step_count / max_steps):
             progress.message(
-                f"step {interaction.step_count}: lesson {session.lesson + 1} of "
+                f"step {env_runner.step_count}: lesson {session.lesson + 1} of "
                 f"{session.lesson_count} begins"
             )
         with timed("summary"):
             summary.report(session, progress)
-        if interaction.step_count - saved_at >= settings.checkpoint_interval:
-            saved_at = interaction.step_count
+        if env_runner.step_count - saved_at >= settings.checkpoint_interval:
+            saved_at = env_runner.step_count
             path = _save(session, checkpoints, saved_at, session.state_dict(), summary.score)
             summary.note_checkpoint(path)
-    _save(session, checkpoints, interaction.step_count, session.state_dict(), summary.score)
+    _save(session, checkpoints, env_runner.step_count, session.state_dict(), summary.score)
     return True
 
 

@@ -24,18 +24,18 @@ def learn(run: RunSettings, registries: Registries, referee: Referee) -> Act:
         session.reset()
         act = policy_of(session)
         referee.start()
-        while session.interaction.step_count < steps:
-            progress = session.interaction.step_count / steps
+        while session.env_runner.step_count < steps:
+            progress = session.env_runner.step_count / steps
             session.algorithm.collect()
             session.algorithm.update(progress)
-            session.interaction.take_finished()
-            referee.look(session.interaction.step_count, act)
+            session.env_runner.pop_finished()
+            referee.look(session.env_runner.step_count, act)
         return act
 
 
 def policy_of(session: Session) -> Act:
     """The session's deterministic policy, which goes on learning with it."""
-    env = session.interaction.env
+    env = session.env_runner.env
 
     @torch.no_grad()
     def act(raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:

@@ -76,5 +76,5 @@ class _Set:
             self.simulator.render(everywhere, self._views)
         else:
             seeds = self._rng.integers(2**63, size=len(everywhere), dtype=np.uint64)
-            self.simulator.sense(everywhere, self._views, self._space, seeds)
+            self.simulator.render_depth(everywhere, self._views, self._space, seeds)
         return len(everywhere)

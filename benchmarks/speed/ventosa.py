@@ -19,7 +19,7 @@ from trainers.algorithms.schedules import Schedule
 from trainers.networks.actor_critic import PolicySettings
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.summary import Summary
-from trainers.reporting.terminal import make_progress
+from trainers.reporting.terminal import make_display
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import Component, RunSettings, WeightedReward
 from trainers.saving.checkpoint import Checkpoints
@@ -45,14 +45,14 @@ class Ventosa:
             self._session.reset()
             self._summary = Summary(log, "speed", 1, self._settings.summary_freq)
             self._checkpoints = _NoCheckpoints(folder, 1)
-            self._progress = make_progress("speed", 1, 1, console=Console(quiet=True))
+            self._progress = make_display("speed", 1, 1, console=Console(quiet=True))
             self._stack = stack.pop_all()
         policy = self._session.algorithm.policy
         self.parameters = sum(parameter.numel() for parameter in policy.parameters())
 
     def learn(self) -> None:
         """See `Contender`."""
-        steps = self._session.interaction.step_count + self._buffer_size
+        steps = self._session.env_runner.step_count + self._buffer_size
         settings = self._settings.model_copy(update={"max_steps": steps})
         train(self._session, settings, self._summary, self._checkpoints, self._progress)
 

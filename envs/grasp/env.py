@@ -77,13 +77,13 @@ class GraspEnv(gymnasium.Env[Any, NDArray[Any]]):
     def step(
         self, action: NDArray[Any]
     ) -> tuple[dict[str, NDArray[Any]], float, bool, bool, dict[str, Any]]:
-        """Moves the robot; `info` holds the reward's terms and the measures as plain numbers."""
+        """Moves the robot; `info` holds reward terms and episode metrics as plain numbers."""
         observations, reward, terminated, truncated, infos = self._batch.step_without_reset(
             np.asarray(action)[None]
         )
         info = {
             key: {name: float(values[0]) for name, values in infos[key].items()}
-            for key in ("reward_terms", "measures")
+            for key in ("reward_terms", "episode_metrics")
         }
         return (
             _first(observations),

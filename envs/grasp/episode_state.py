@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import Views
+from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Camera
-from envs.grasp.task import GoalRegion, Progress, Tools
+from envs.grasp.task import EpisodeProgress, GoalRegion, Tools
 
-BATCHES = {"scenes": Scenes, "region": GoalRegion, "tools": Tools, "progress": Progress}
+BATCHES = {"scenes": Scenes, "region": GoalRegion, "tools": Tools, "progress": EpisodeProgress}
 
 
 @dataclass(frozen=True)
-class Episodes:
+class RunningEpisodes:
     """N running episodes. Arrays are replaced, never written to: they may be in use elsewhere.
 
     Attributes:
@@ -33,16 +33,16 @@ class Episodes:
     scenes: Scenes
     region: GoalRegion
     tools: Tools
-    progress: Progress
-    views: dict[str, Views]
+    progress: EpisodeProgress
+    views: dict[str, CameraPoses]
     images: dict[str, NDArray[Any]]
 
-    def with_rows(self, indices: NDArray[np.int64], others: Episodes) -> Episodes:
+    def with_rows(self, indices: NDArray[np.int64], others: RunningEpisodes) -> RunningEpisodes:
         """These, with other episodes at some indices."""
         images = {name: image.copy() for name, image in self.images.items()}
         for name, image in others.images.items():
             images[name][indices] = image
-        return Episodes(
+        return RunningEpisodes(
             scenes=self.scenes.with_rows(indices, others.scenes),
             region=self.region.with_rows(indices, others.region),
             tools=self.tools.with_rows(indices, others.tools),
@@ -60,10 +60,15 @@ class Episodes:
         }
 
     @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any], cameras: Mapping[str, Camera]) -> Episodes:
+    def from_state_dict(
+        cls, state: Mapping[str, Any], cameras: Mapping[str, Camera]
+    ) -> RunningEpisodes:
         """The episodes of a `state_dict`."""
         return cls(
             **{name: batch(**state[name]) for name, batch in BATCHES.items()},
-            views={name: Views(camera, **state["views"][name]) for name, camera in cameras.items()},
+            views={
+                name: CameraPoses(camera, **state["views"][name])
+                for name, camera in cameras.items()
+            },
             images=dict(state["images"]),
         )

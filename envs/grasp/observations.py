@@ -10,7 +10,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage, RgbImage
-from envs.grasp.episode_state import Episodes
+from envs.grasp.episode_state import RunningEpisodes
 from envs.grasp.sensors.camera import focal_length_px
 from envs.grasp.settings import GraspSettings
 
@@ -40,7 +40,7 @@ def observation_space(settings: GraspSettings) -> gymnasium.spaces.Dict:
     return gymnasium.spaces.Dict(spaces)
 
 
-def privileged_state(episodes: Episodes, episode_steps: int) -> NDArray[np.float32]:
+def privileged_state(episodes: RunningEpisodes, episode_steps: int) -> NDArray[np.float32]:
     """True state (N, 22): tool and target pose, goal limits, the episode's progress."""
     scenes, tools, region = episodes.scenes, episodes.tools, episodes.region
     progress, yaw = episodes.progress, episodes.scenes.target_yaw_rad

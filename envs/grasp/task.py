@@ -21,7 +21,7 @@ from envs.grasp.robot.urdf import HOME_JOINTS_RAD, load_robot
 from envs.grasp.scene.sampler import Scenes, heading
 from envs.grasp.settings import Goal, Workspace
 from envs.grasp.simulators.base import Contacts
-from rewards.grasp.transition import Transition
+from rewards.grasp.transition import GraspTransition
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -59,7 +59,7 @@ def goal_middle_m(goal: Goal) -> Floats:
 
 
 @dataclass(frozen=True)
-class Progress(Batch):
+class EpisodeProgress(Batch):
     """What has happened in N running episodes; arrays (N,)."""
 
     steps: NDArray[np.int64]
@@ -69,7 +69,7 @@ class Progress(Batch):
     rotation_right: Bools
 
     @classmethod
-    def start(cls, n: int) -> Progress:
+    def start(cls, n: int) -> EpisodeProgress:
         """N episodes that have just begun."""
         return cls(np.zeros(n, np.int64), *(np.zeros(n, bool) for _ in range(4)))
 
@@ -147,13 +147,15 @@ class Motion:
     contacts: Contacts
 
 
-def judge(motion: Motion, scenes: Scenes, region: GoalRegion, progress: Progress) -> Transition:
+def judge(
+    motion: Motion, scenes: Scenes, region: GoalRegion, progress: EpisodeProgress
+) -> GraspTransition:
     """Puts together what is true of N motions, before N scenes with these goals."""
     before, after = motion.before, motion.after
     offset = block_offset(after.tooltip_m, scenes.target_m, scenes.target_yaw_rad)
     error = yaw_error(after.yaw_rad, scenes.target_yaw_rad)
     position_right = region.position_is_right(offset)
-    return Transition(
+    return GraspTransition(
         previous_tooltip_m=before.tooltip_m,
         tooltip_m=after.tooltip_m,
         tool_axis=after.axis,
@@ -172,7 +174,7 @@ def judge(motion: Motion, scenes: Scenes, region: GoalRegion, progress: Progress
     )
 
 
-def advance(progress: Progress, transition: Transition) -> Progress:
+def advance(progress: EpisodeProgress, transition: GraspTransition) -> EpisodeProgress:
     """The episodes' progress after a transition."""
     return replace(
         progress,

@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from curricula.samplers import ParameterValue, draw
 from encoders.spaces import DepthImage
 from envs.environment import Environment, Observations, StepResult
-from envs.grasp.episode_state import Episodes
+from envs.grasp.episode_state import RunningEpisodes
 from envs.grasp.evaluation.pick import PickCheck, Picker
-from envs.grasp.evaluation.pose_commands import Aims
-from envs.grasp.evaluation.report import GraspAlbum
+from envs.grasp.evaluation.pose_commands import PoseCommands
+from envs.grasp.evaluation.report import GraspReport
 from envs.grasp.observations import PRIVILEGED, observation_space, privileged_state
 from envs.grasp.scene.sampler import Scenes, SceneSampler
-from envs.grasp.sensors.camera import Views, overviews
+from envs.grasp.sensors.camera import CameraPoses, overviews
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.factory import make_simulator
-from envs.grasp.task import Arm, GoalRegion, Motion, Progress, advance, goal_middle_m, judge
-from rewards.grasp.transition import Transition
+from envs.grasp.task import Arm, EpisodeProgress, GoalRegion, Motion, advance, goal_middle_m, judge
+from rewards.grasp.transition import GraspTransition
 from rewards.reward import RewardTerm, weigh
 
 GOAL_PARAMETERS = ("lateral_limit_m", "vertical_limit_m", "gap_limit_m", "yaw_limit_deg")
@@ -74,7 +74,7 @@ class GraspVectorEnv(Environment):
         self._arm = Arm(settings.workspace, settings.motion_checks)
         self._sampler = SceneSampler(settings)
         self._everyone = np.arange(self.num_envs)
-        self._episodes: Episodes | None = None
+        self._episodes: RunningEpisodes | None = None
         self._rng = np.random.default_rng(seed)
         self._simulator = make_simulator(settings, self.num_envs, render_mode == "human")
 
@@ -118,7 +118,7 @@ class GraspVectorEnv(Environment):
         truncated = ~terminated & (steps >= self._settings.episode_steps)
         infos = {
             "reward_terms": terms,
-            "measures": self._measures(transition),
+            "episode_metrics": self._episode_metrics(transition),
             "same_frame": np.full(self.num_envs, self._settings.frame_grab),
         }
         reward = sum(terms.values(), np.zeros(self.num_envs))
@@ -148,7 +148,7 @@ class GraspVectorEnv(Environment):
     def load_state_dict(self, state: dict[str, Any]) -> Observations:
         """See `Environment.load_state_dict`."""
         self._rng.bit_generator.state = state["rng"]
-        self._episodes = episodes = Episodes.from_state_dict(state, self._settings.cameras)
+        self._episodes = episodes = RunningEpisodes.from_state_dict(state, self._settings.cameras)
         self._simulator.load(self._everyone, episodes.scenes, episodes.tools.joints_rad)
         return self._observations()
 
@@ -157,11 +157,11 @@ class GraspVectorEnv(Environment):
     def physical_check(self, *, window: bool = False) -> PickCheck:
         """The pick; see `Environment.physical_check` and `envs.grasp.evaluation.pick`."""
         picker = Picker(self._settings.support, self._settings.pick, window)
-        return PickCheck(picker, self._aims)
+        return PickCheck(picker, self._pose_commands)
 
-    def album(self) -> GraspAlbum:
+    def album(self) -> GraspReport:
         """See `Environment.album`."""
-        return GraspAlbum(self._settings, self._aims)
+        return GraspReport(self._settings, self._pose_commands)
 
     # -- the task --------------------------------------------------------------------------------
 
@@ -179,11 +179,11 @@ class GraspVectorEnv(Environment):
         """The actions (N, 4) that lead to tooltips (N, 3) and yaws (N,)."""
         return self._arm.action(tooltip_m, yaw_rad)
 
-    def _aims(self, actions: NDArray[Any]) -> Aims:
+    def _pose_commands(self, actions: NDArray[Any]) -> PoseCommands:
         """Where actions (n, 4) would lead in the first n environments."""
         n, episodes = len(actions), self._running()
         tooltip_m, yaw_rad = self._arm.pose(np.asarray(actions, np.float64))
-        return Aims(
+        return PoseCommands(
             scenes=episodes.scenes[:n],
             tooltip_m=tooltip_m,
             yaw_rad=yaw_rad,
@@ -191,12 +191,12 @@ class GraspVectorEnv(Environment):
             images={name: images[:n] for name, images in episodes.images.items()},
         )
 
-    def _running(self) -> Episodes:
+    def _running(self) -> RunningEpisodes:
         if self._episodes is None:
             raise gymnasium.error.ResetNeeded("call reset() first: no episode has begun yet")
         return self._episodes
 
-    def _move(self, actions: NDArray[np.float64]) -> Transition:
+    def _move(self, actions: NDArray[np.float64]) -> GraspTransition:
         """Moves all robots, and brings the episodes up to date."""
         episodes = self._running()
         after, path, duration_s = self._arm.reach(episodes.tools, actions)
@@ -222,11 +222,11 @@ class GraspVectorEnv(Environment):
             views = {k: view.with_arrays({"noise_sigma_m": sigma_m}) for k, view in views.items()}
         tools = self._arm.home(n)
         self._simulator.load(indices, scenes, tools.joints_rad)
-        begun = Episodes(
+        begun = RunningEpisodes(
             scenes=scenes,
             region=GoalRegion.like(self._settings.goal, n).with_arrays(limits),
             tools=tools,
-            progress=Progress.start(n),
+            progress=EpisodeProgress.start(n),
             views=views,
             images=self._pictures(indices, views),
         )
@@ -234,7 +234,7 @@ class GraspVectorEnv(Environment):
         self._episodes = begun if whole else self._running().with_rows(indices, begun)
 
     def _pictures(
-        self, indices: NDArray[np.int64], views: Mapping[str, Views]
+        self, indices: NDArray[np.int64], views: Mapping[str, CameraPoses]
     ) -> dict[str, NDArray[Any]]:
         """What each camera observes now in some worlds, (n, H, W, C) by its name."""
         pictures: dict[str, NDArray[Any]] = {}
@@ -242,7 +242,7 @@ class GraspVectorEnv(Environment):
             space = self.single_observation_space[name]
             if isinstance(space, DepthImage):
                 seeds = self._rng.integers(2**63, size=len(indices), dtype=np.uint64)
-                pictures[name] = self._simulator.sense(indices, view, space, seeds)
+                pictures[name] = self._simulator.render_depth(indices, view, space, seeds)
             else:
                 pictures[name] = self._simulator.render(indices, view)
         return pictures
@@ -254,7 +254,7 @@ class GraspVectorEnv(Environment):
             observations[PRIVILEGED] = privileged_state(episodes, self._settings.episode_steps)
         return observations
 
-    def _measures(self, transition: Transition) -> dict[str, NDArray[Any]]:
+    def _episode_metrics(self, transition: GraspTransition) -> dict[str, NDArray[Any]]:
         """What to report: errors to the middle of the final goal region, and how it went."""
         error = np.abs(transition.offset_m - goal_middle_m(self._settings.goal))
         return {

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, FiniteFloat
 
-from rewards.grasp.transition import Bools, Transition
+from rewards.grasp.transition import Bools, GraspTransition
 
 
 class Touch:
@@ -20,7 +20,7 @@ class Touch:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
 
-    def __call__(self, transition: Transition) -> NDArray[np.float64]:
+    def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
         """Return the rewards, (N,)."""
         return _pay_once(self._settings.amount, transition.touched, transition.touched_before)
 
@@ -38,7 +38,7 @@ class Collision:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
 
-    def __call__(self, transition: Transition) -> NDArray[np.float64]:
+    def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
         """Return the rewards, (N,)."""
         return np.where(transition.collided, self._settings.amount, 0.0)
 
@@ -56,7 +56,7 @@ class Position:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
 
-    def __call__(self, transition: Transition) -> NDArray[np.float64]:
+    def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
         """Return the rewards, (N,)."""
         return _pay_once(
             self._settings.amount, transition.position_right, transition.position_right_before
@@ -76,7 +76,7 @@ class Rotation:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
 
-    def __call__(self, transition: Transition) -> NDArray[np.float64]:
+    def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
         """Return the rewards, (N,)."""
         return _pay_once(
             self._settings.amount, transition.rotation_right, transition.rotation_right_before

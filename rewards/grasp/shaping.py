@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, FiniteFloat
 
-from rewards.grasp.transition import Transition
+from rewards.grasp.transition import GraspTransition
 
 
 class Approach:
@@ -35,7 +35,7 @@ class Approach:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
 
-    def __call__(self, transition: Transition) -> NDArray[np.float64]:
+    def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
         """Return the rewards, (N,); 0 where the tooltip is on the target or no time passed."""
         velocity = transition.tooltip_m - transition.previous_tooltip_m
         if self._settings.velocity == "per_second":
@@ -61,7 +61,7 @@ class Facing:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
 
-    def __call__(self, transition: Transition) -> NDArray[np.float64]:
+    def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
         """Return the rewards, (N,)."""
         return -self._settings.gain * _dot(transition.target_normal, transition.tool_axis)
 
@@ -96,7 +96,7 @@ class Precision:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
 
-    def __call__(self, transition: Transition) -> NDArray[np.float64]:
+    def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
         """Return the rewards, (N,), never positive."""
         settings = self._settings
         offset = (transition.offset_m - [0.0, 0.0, settings.gap_m]) / settings.position_scale_m

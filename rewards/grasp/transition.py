@@ -10,7 +10,7 @@ Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Transition:
+class GraspTransition:
     """A snapshot of N environments after one action, before any of them is reset.
 
     Points and vectors are in the world frame (metres, Z up) unless said otherwise.

@@ -7,7 +7,7 @@ import numpy as np
 from envs.grasp.robot.kinematics import InverseKinematics
 from envs.grasp.robot.urdf import HOME_JOINTS_RAD, load_robot
 from envs.grasp.scene.sampler import Scenes, SceneSampler
-from envs.grasp.sensors.camera import Views, sample_views
+from envs.grasp.sensors.camera import CameraPoses, sample_views
 from envs.grasp.settings import Camera, GraspSettings
 
 ROBOT = load_robot()
@@ -27,11 +27,11 @@ def pose(x: float, y: float, z: float, yaw: float = 0.0) -> np.ndarray:
     return joints[:, None]
 
 
-def fixed_views(camera: Camera, count: int = 1) -> Views:
+def fixed_views(camera: Camera, count: int = 1) -> CameraPoses:
     return sample_views(camera, np.random.default_rng(0), count, 0.0, 0.0)
 
 
-def sampled(count: int, seed: int = 0, **cameras: Camera) -> tuple[Scenes, dict[str, Views]]:
+def sampled(count: int, seed: int = 0, **cameras: Camera) -> tuple[Scenes, dict[str, CameraPoses]]:
     settings = GraspSettings(cameras=cameras or {"depth": Camera(type="depth")})
     return SceneSampler(settings).sample(np.random.default_rng(seed), np.full(count, np.pi))
 

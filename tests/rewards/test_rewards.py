@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from pydantic import ValidationError
 
-from rewards.grasp.transition import Transition
+from rewards.grasp.transition import GraspTransition
 from rewards.plugin import ventosa_rewards
 
 REWARDS = ventosa_rewards()
@@ -24,7 +24,7 @@ def still(n=1):
     """N environments where nothing happens: the tool 1 m in front of a face that looks at it."""
     point = np.tile([1.0, 0.0, 0.5], (n, 1))
     no = np.zeros(n, dtype=bool)
-    return Transition(
+    return GraspTransition(
         previous_tooltip_m=point - [1.0, 0.0, 0.0],
         tooltip_m=point - [1.0, 0.0, 0.0],
         tool_axis=np.tile([1.0, 0.0, 0.0], (n, 1)),
@@ -200,7 +200,7 @@ def test_single_precision_does_not_become_the_precision_of_the_reward():
         for key, value in vars(still(2)).items()
     }
     for reward in REWARDS.values():
-        assert reward(reward.Settings())(Transition(**single)).dtype == np.float64
+        assert reward(reward.Settings())(GraspTransition(**single)).dtype == np.float64
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def test_what_is_reported_are_the_environments_own_rewards(
     session = make_session(PENDULUM, NORMALIZED)
     session.algorithm.collect()
     session.algorithm.update(0.0)
-    returns = session.interaction.take_finished().rewards
+    returns = session.env_runner.pop_finished().rewards
     assert len(returns) == 2
     assert np.all(returns < -20)  # swinging about at random costs some 5 a step
 
@@ -111,6 +111,6 @@ def test_it_learns_to_balance_a_pole(make_session: Callable[..., Session]) -> No
     for _ in range(40):
         algorithm.collect()
         algorithm.update(0.0)
-    lengths = algorithm._interaction.take_finished().lengths
+    lengths = algorithm._env_runner.pop_finished().lengths
     assert lengths[:20].mean() < 40
     assert lengths[-10:].mean() > 80

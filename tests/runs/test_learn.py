@@ -18,7 +18,7 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from envs.grasp.simulators import workers
-from trainers.experience.env_runner import Interaction
+from trainers.experience.env_runner import EnvRunner
 from trainers.learn import Stop, main, parse, stop_on_signals
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import load_run
@@ -69,14 +69,14 @@ def call_at_env_step(
     monkeypatch: pytest.MonkeyPatch, number: int, action: Callable[[], None]
 ) -> None:
     """Does something just before the environments' nth step from now."""
-    step, calls = Interaction.step, iter(range(1, 10**6))
+    step, calls = EnvRunner.step, iter(range(1, 10**6))
 
-    def stepped(self: Interaction, actions: Any) -> Any:
+    def stepped(self: EnvRunner, actions: Any) -> Any:
         if next(calls) == number:
             action()
         return step(self, actions)
 
-    monkeypatch.setattr(Interaction, "step", stepped)
+    monkeypatch.setattr(EnvRunner, "step", stepped)
 
 
 def send(number: signal.Signals) -> Callable[[], None]:

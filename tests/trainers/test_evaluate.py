@@ -14,7 +14,7 @@ from trainers import evaluation
 from trainers.common.errors import UserError
 from trainers.evaluate import main
 from trainers.runfile.registry import Registries
-from trainers.saving.evaluation_folder import REPORT, Gallery
+from trainers.saving.evaluation_folder import REPORT, EvaluationFolder
 
 GRASP: dict[str, Any] = {
     "type": "grasp",
@@ -95,7 +95,7 @@ def test_a_window_needs_a_display(
 
 class TestGallery:
     def write(self, folder: Path, content: bytes) -> None:
-        Gallery(folder, ["a.png"]).write({"success": 0.5}, [("a.png", content)])
+        EvaluationFolder(folder, ["a.png"]).write({"success": 0.5}, [("a.png", content)])
 
     def test_replaces_what_an_evaluation_left(self, tmp_path: Path) -> None:
         for content in (b"first", b"second"):

@@ -12,7 +12,7 @@ import torch
 
 from curricula.samplers import UniformSampler
 from trainers.common.errors import UserError
-from trainers.experience.env_runner import Episodes
+from trainers.experience.env_runner import EpisodeBatch
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings
 from trainers.session import Session, resolve_device
@@ -100,7 +100,7 @@ def test_the_environment_is_closed_when_the_rest_does_not_fit(
     assert len(closed) == 1
     session = Session(make_run("target"), registries)
     session.close()
-    assert closed[1:] == [session.interaction.env]
+    assert closed[1:] == [session.env_runner.env]
 
 
 def test_settings_the_environment_refuses_name_its_section(
@@ -117,7 +117,7 @@ def test_settings_the_environment_refuses_name_its_section(
 
 
 def parameters(session: Session) -> dict[str, Any]:
-    return dict(session.interaction.env.parameters)  # type: ignore[attr-defined]
+    return dict(session.env_runner.env.parameters)  # type: ignore[attr-defined]
 
 
 def test_a_lessons_parameters_stand_over_the_runs(make_session: MakeSession) -> None:
@@ -132,8 +132,8 @@ def test_a_lessons_parameters_stand_over_the_runs(make_session: MakeSession) -> 
     assert (session.lesson, session.lesson_count) == (0, 1)
 
 
-def episodes(*rewards: float) -> Episodes:
-    return Episodes(np.array(rewards), np.ones(len(rewards)), {}, {})
+def episodes(*rewards: float) -> EpisodeBatch:
+    return EpisodeBatch(np.array(rewards), np.ones(len(rewards)), {}, {})
 
 
 def test_lessons_advance_with_the_episodes_and_set_the_environment(
@@ -170,7 +170,7 @@ def test_a_state_taken_up_goes_on_in_its_lesson(make_session: MakeSession) -> No
     assert parameters(other) == {"scale": 2.0}
     assert other.advance_curriculum(episodes(0.9), 0.1)  # the second good one of this lesson
     np.testing.assert_equal(
-        other.interaction.observations["goal"], session.interaction.observations["goal"]
+        other.env_runner.observations["goal"], session.env_runner.observations["goal"]
     )
 
 
@@ -186,7 +186,7 @@ def test_equal_seeds_begin_alike_and_others_do_not(make_session: MakeSession) ->
     first, again, other = (make_session("target", seed=seed) for seed in (1, 1, 2))
     for name, tensor in first.weights().items():
         assert torch.equal(tensor, again.weights()[name])
-    goal = first.interaction.observations["goal"]
-    np.testing.assert_array_equal(goal, again.interaction.observations["goal"])
-    assert not np.array_equal(goal, other.interaction.observations["goal"])
+    goal = first.env_runner.observations["goal"]
+    np.testing.assert_array_equal(goal, again.env_runner.observations["goal"])
+    assert not np.array_equal(goal, other.env_runner.observations["goal"])
     assert any(not torch.equal(t, other.weights()[name]) for name, t in first.weights().items())

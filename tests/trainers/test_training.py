@@ -63,7 +63,7 @@ class Training:
 
     @property
     def steps(self) -> int:
-        return self.session.interaction.step_count
+        return self.session.env_runner.step_count
 
     @property
     def saved(self) -> list[int]:
@@ -240,13 +240,13 @@ def as_arrays(state: Any) -> Any:
 
 
 def breaking_after(one: Training, steps: int, breakage: Callable[[Any], Any]) -> None:
-    step = one.session.interaction.env.step
+    step = one.session.env_runner.env.step
 
     def broken(actions: np.ndarray) -> Any:
         result = step(actions)
         return breakage(result) if one.steps >= steps else result
 
-    one.session.interaction.env.step = broken  # type: ignore[method-assign]
+    one.session.env_runner.env.step = broken  # type: ignore[method-assign]
 
 
 def test_a_broken_environment_leaves_the_run_saved(training: Callable[..., Training]) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from trainers.networks.observations import Observations, take
+from trainers.networks.observations import Observations, gather
 
 Augmentation = Callable[[Observations], Observations]
 
@@ -40,7 +40,7 @@ class RandomShift:
         count, height, width, _ = images.shape
         rows, columns = self._sources(count, height), self._sources(count, width)
         picked = torch.arange(count, device=images.device)[:, None, None]
-        return take(images, (picked, rows[:, :, None], columns[:, None, :]))
+        return gather(images, (picked, rows[:, :, None], columns[:, None, :]))
 
     def _sources(self, count: int, length: int) -> Tensor:
         """From where along an axis each pixel of each image comes, (count, length)."""

@@ -25,8 +25,8 @@ class TrainerSettings(BaseModel, frozen=True, extra="forbid"):
 class Algorithm(Protocol):
     """Learns by collecting experience and updating its policy, in turns.
 
-    Built as `cls(factory, settings, interaction, generator, device)`, from a `NetworkFactory`, its
-    own settings, an `Interaction`, the source of its randomness and the torch device.
+    Built as `cls(factory, settings, env_runner, generator, device)`, from a `NetworkFactory`, its
+    own settings, an `EnvRunner`, the source of its randomness and the torch device.
 
     Attributes:
         policy: what is saved as the weights, and evaluated.

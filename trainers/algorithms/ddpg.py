@@ -16,15 +16,15 @@ from torch.nn import functional as F
 from trainers.algorithms.augmentation import RandomShift, unchanged
 from trainers.algorithms.base import TrainerSettings
 from trainers.algorithms.exploration import GaussianSettings, Noise, NoiseSettings
-from trainers.algorithms.optimization import descend
+from trainers.algorithms.optimization import optimizer_step
 from trainers.algorithms.schedules import CONSTANT, Schedule
 from trainers.common.timers import timed
-from trainers.experience.env_runner import Interaction, Step
+from trainers.experience.env_runner import EnvRunner, Step
 from trainers.experience.replay_buffer import ReplayBuffer
 from trainers.networks.actor_critic import to_environment, with_rows
 from trainers.networks.deterministic import DeterministicPolicy, DeterministicSettings
 from trainers.networks.network import NetworkFactory
-from trainers.networks.observations import Observations, take, to_tensors
+from trainers.networks.observations import Observations, gather, to_tensors
 from trainers.reporting.event_log import Averager
 
 
@@ -122,13 +122,13 @@ class DDPG:
         self,
         factory: NetworkFactory,
         settings: DDPGSettings,
-        interaction: Interaction,
+        env_runner: EnvRunner,
         generator: torch.Generator,
         device: torch.device,
     ):
         self._settings, self._hyperparameters = settings, settings.hyperparameters
-        self._interaction, self._generator, self._device = interaction, generator, device
-        hyper, env = settings.hyperparameters, interaction.env
+        self._env_runner, self._generator, self._device = env_runner, generator, device
+        hyper, env = settings.hyperparameters, env_runner.env
         self.policy = DeterministicPolicy(factory, settings.network_settings, hyper.tau).to(device)
         online = self.policy.online
         self._actor_parameters = online.actor_parameters()
@@ -147,7 +147,7 @@ class DDPG:
         )
         # Without a future there is no value to estimate, nor anything to look at.
         self._targets = self._bootstrapped_returns if hyper.gamma else self._buffer.rewards
-        self._due = 0.0  # updates that were asked for by transitions, and not made yet
+        self._pending_updates = 0.0  # updates that were asked for by transitions, and not made yet
         self._moments: list[_Moment] = []
         self._features: Tensor | None = None  # what the actor makes of the frames in view, (N, f)
         self._new = np.arange(0)  # where the frame came into view with the last step
@@ -186,11 +186,13 @@ class DDPG:
         self._remember(moments)
         averager = Averager()
         if len(self._buffer) >= self._hyperparameters.buffer_init_steps:
-            self._due += len(moments) * self._shape[0] * self._hyperparameters.updates_per_step
-        while self._due >= self._hyperparameters.policy_delay:
-            self._due -= self._hyperparameters.policy_delay
+            self._pending_updates += (
+                len(moments) * self._shape[0] * self._hyperparameters.updates_per_step
+            )
+        while self._pending_updates >= self._hyperparameters.policy_delay:
+            self._pending_updates -= self._hyperparameters.policy_delay
             averager.add(self._learn())
-        return averager.take() | schedules
+        return averager.pop_means() | schedules
 
     def state_dict(self) -> dict[str, Any]:
         """See `Algorithm.state_dict`."""
@@ -200,7 +202,7 @@ class DDPG:
             "critic_optimizer": self._critic_optimizer.state_dict(),
             "generator": self._generator.get_state(),
             "noise": self._noise.state,
-            "due": self._due,
+            "due": self._pending_updates,
             "replay_buffer": self._buffer.state_dict() if remembered else None,
         }
 
@@ -213,29 +215,29 @@ class DDPG:
         self._critic_optimizer.load_state_dict(state["critic_optimizer"])
         self._generator.set_state(state["generator"])
         self._noise.state = state["noise"].to(self._device)
-        self._due = state["due"]
+        self._pending_updates = state["due"]
 
     # -- collecting ------------------------------------------------------------------------------
 
     def _play(self) -> _Moment:
         """Acts once in every environment."""
-        interaction, space = self._interaction, self._interaction.env.single_action_space
-        before = interaction.observations
+        env_runner, space = self._env_runner, self._env_runner.env.single_action_space
+        before = env_runner.observations
         with timed("act"):
             actions = self._explore(before)
-        step = interaction.step(to_environment(self.policy.to_space(actions), space))
+        step = env_runner.step(to_environment(self.policy.to_space(actions), space))
         self._new = np.flatnonzero(~step.same_frame)
         ended = torch.from_numpy(step.done)
         self._noise.restart(ended.to(self._device))
-        return _Moment(before, actions.cpu().numpy(), step, interaction.observations)
+        return _Moment(before, actions.cpu().numpy(), step, env_runner.observations)
 
     def _explore(self, raw: Mapping[str, NDArray[Any]]) -> Tensor:
         """Actions (N, A) in [-1, 1]."""
-        step, hyper = self._interaction.step_count, self._hyperparameters
+        step, hyper = self._env_runner.step_count, self._hyperparameters
         uniform = 2.0 * self._rand(self._shape) - 1.0
         if step < hyper.buffer_init_steps:
             return uniform
-        space = self._interaction.env.single_observation_space
+        space = self._env_runner.env.single_observation_space
         observations = to_tensors(raw, space, self._device)
         actions = self.policy.online.act(observations, self._look(observations.frames))
         sigma = self._sigma(step / self._settings.max_steps)
@@ -249,7 +251,7 @@ class DDPG:
             self._features = online.encode_frames(frames)
         elif len(self._new):
             rows = torch.from_numpy(self._new).to(self._device)
-            fresh = online.encode_frames({name: take(f, rows) for name, f in frames.items()})
+            fresh = online.encode_frames({name: gather(f, rows) for name, f in frames.items()})
             self._features = with_rows(self._features, rows, fresh)
         return self._features
 
@@ -280,48 +282,50 @@ class DDPG:
         """Adds what was collected to the buffer and to the statistics of the observations."""
         for moment in moments:
             self._buffer.add(moment.observations, moment.actions, moment.step, moment.following)
-        space = self._interaction.env.single_observation_space
+        space = self._env_runner.env.single_observation_space
         vectors = [to_tensors(m.observations, space, self._device).vectors for m in moments]
         self.policy.update_statistics({k: torch.cat([v[k] for v in vectors]) for k in vectors[0]})
 
     def _learn(self) -> dict[str, float]:
         """One round of updates (Lillicrap et al. 2015, algorithm 1)."""
         for _ in range(self._hyperparameters.policy_delay):
-            places = self._buffer.sample(self._hyperparameters.batch_size, self._generator)
-            value_loss, value = self._improve_critic(places)
-        policy_loss = self._improve_actor(places)
-        self.policy.follow()
+            indices = self._buffer.sample(self._hyperparameters.batch_size, self._generator)
+            value_loss, value = self._improve_critic(indices)
+        policy_loss = self._improve_actor(indices)
+        self.policy.update_targets()
         numbers = torch.stack([value_loss, policy_loss, value]).tolist()
         names = ("Losses/Value Loss", "Losses/Policy Loss", "Policy/Q Value")
         return dict(zip(names, numbers, strict=True))
 
-    def _improve_critic(self, places: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
+    def _improve_critic(self, indices: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
         """Descends the mean of (Q(s, a) - y)^2; returns it, and the mean of Q(s, a)."""
         online = self.policy.online
-        targets = self._targets(places)
-        observations = self._augment(self._buffer.observations(places, online.critic_sees))
-        values = online.value(observations, self._buffer.actions(places))
+        targets = self._targets(indices)
+        observations = self._augment(self._buffer.observations(indices, online.critic_sees))
+        values = online.value(observations, self._buffer.actions(indices))
         loss = F.mse_loss(values, targets)
-        self._descend(self._critic_optimizer, loss, self._critic_parameters)
+        self._optimizer_step(self._critic_optimizer, loss, self._critic_parameters)
         return loss.detach(), values.detach().mean()
 
-    def _improve_actor(self, places: NDArray[np.int64]) -> Tensor:
+    def _improve_actor(self, indices: NDArray[np.int64]) -> Tensor:
         """Descends the mean of -Q(s, mu(s)); returns it."""
         online = self.policy.online
-        observations = self._augment(self._buffer.observations(places, self._seen))
+        observations = self._augment(self._buffer.observations(indices, self._seen))
         loss = -online.value(observations, online.act(observations)).mean()
-        self._descend(self._actor_optimizer, loss, self._actor_parameters)
+        self._optimizer_step(self._actor_optimizer, loss, self._actor_parameters)
         return loss.detach()
 
     @torch.no_grad()
-    def _bootstrapped_returns(self, places: NDArray[np.int64]) -> Tensor:
+    def _bootstrapped_returns(self, indices: NDArray[np.int64]) -> Tensor:
         """Targets y = R + gamma^k Q'(s', mu'(s')), (B,); R is the return of k steps up to s'."""
         hyper, target = self._hyperparameters, self.policy.target
-        returns, discounts, last = self._buffer.returns(places, hyper.gamma, hyper.n_step)
+        returns, discounts, last = self._buffer.returns(indices, hyper.gamma, hyper.n_step)
         following = self._augment(self._buffer.next_observations(last, self._seen))
         return returns + discounts * target.value(following, target.act(following))
 
-    def _descend(
+    def _optimizer_step(
         self, optimizer: torch.optim.Optimizer, loss: Tensor, parameters: list[nn.Parameter]
     ) -> None:
-        descend(optimizer, loss, parameters, self._max_gradient_norm, self._interaction.step_count)
+        optimizer_step(
+            optimizer, loss, parameters, self._max_gradient_norm, self._env_runner.step_count
+        )

@@ -9,10 +9,10 @@ import torch
 from pydantic import BaseModel, Field, model_validator
 from torch import Tensor, nn
 
-from trainers.algorithms.optimization import descend
+from trainers.algorithms.optimization import optimizer_step
 from trainers.algorithms.schedules import LINEAR, Schedule
 from trainers.experience.collector import OnPolicyCollector
-from trainers.experience.env_runner import Interaction
+from trainers.experience.env_runner import EnvRunner
 from trainers.experience.reward_normalizer import RewardNormalizer
 from trainers.experience.rollout import Rollout
 from trainers.networks.actor_critic import ActorCritic
@@ -51,7 +51,7 @@ class OnPolicyAlgorithm:
         groups: the parameters that gradient descent moves, one group per learning rate. The rates
             are the subclass's to set, in each update.
         hyperparameters: what all algorithms of this kind have.
-        interaction: the environments.
+        env_runner: the environments.
         generator: the source of all randomness.
         device: where the policy lives.
     """
@@ -61,7 +61,7 @@ class OnPolicyAlgorithm:
         policy: ActorCritic,
         groups: Iterable[Iterable[nn.Parameter]],
         hyperparameters: OnPolicyHyperparameters,
-        interaction: Interaction,
+        env_runner: EnvRunner,
         generator: torch.Generator,
         device: torch.device,
     ):
@@ -70,17 +70,17 @@ class OnPolicyAlgorithm:
             [{"params": list(group)} for group in groups], eps=1e-5, fused=True
         )
         self._gamma, self._lambd = hyperparameters.gamma, hyperparameters.lambd
-        count = interaction.env.num_envs
+        count = env_runner.env.num_envs
         self._collector = OnPolicyCollector(
             policy,
-            interaction,
+            env_runner,
             -(-hyperparameters.buffer_size // count),
             generator,
             device,
             RewardNormalizer(count, self._gamma) if hyperparameters.normalize_rewards else None,
         )
         self._max_gradient_norm = hyperparameters.max_gradient_norm
-        self._interaction, self._generator = interaction, generator
+        self._env_runner, self._generator = env_runner, generator
         self._rollout: Rollout | None = None
 
     def initial_state(self, count: int) -> Tensor:
@@ -112,14 +112,14 @@ class OnPolicyAlgorithm:
         self._collector.load_state_dict(state["collector"])
         self._generator.set_state(state["generator"])
 
-    def _take_rollout(self) -> Rollout:
+    def _pop_rollout(self) -> Rollout:
         """The experience of the last collection, for one update alone."""
         rollout, self._rollout = self._rollout, None
         if rollout is None:
             raise RuntimeError("update() comes after collect()")
         return rollout
 
-    def _descend(self, loss: Tensor) -> None:
+    def _optimizer_step(self, loss: Tensor) -> None:
         """One step of gradient descent.
 
         Raises:
@@ -127,5 +127,5 @@ class OnPolicyAlgorithm:
         """
         groups = self._optimizer.param_groups
         parameters = [p for group in groups for p in group["params"] if p.requires_grad]
-        step = self._interaction.step_count
-        descend(self._optimizer, loss, parameters, self._max_gradient_norm, step)
+        step = self._env_runner.step_count
+        optimizer_step(self._optimizer, loss, parameters, self._max_gradient_norm, step)

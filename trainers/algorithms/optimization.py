@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from trainers.experience.env_runner import NonFiniteError
 
 
-def descend(
+def optimizer_step(
     optimizer: torch.optim.Optimizer,
     loss: Tensor,
     parameters: Sequence[nn.Parameter],

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from trainers.algorithms.base import TrainerSettings
 from trainers.algorithms.on_policy import OnPolicyAlgorithm, OnPolicyHyperparameters
 from trainers.algorithms.schedules import CONSTANT, LINEAR, Schedule
-from trainers.experience.env_runner import Interaction
+from trainers.experience.env_runner import EnvRunner
 from trainers.experience.returns import explained_variance, normalize
 from trainers.experience.rollout import Rollout
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
@@ -62,7 +62,7 @@ class PPO(OnPolicyAlgorithm):
         self,
         factory: NetworkFactory,
         settings: PPOSettings,
-        interaction: Interaction,
+        env_runner: EnvRunner,
         generator: torch.Generator,
         device: torch.device,
     ):
@@ -73,11 +73,11 @@ class PPO(OnPolicyAlgorithm):
         groups: tuple[Iterable[nn.Parameter], ...] = (chain(actor, critic),)
         if settings.hyperparameters.critic_learning_rate is not None:
             groups = (actor, critic)
-        super().__init__(policy, groups, settings.hyperparameters, interaction, generator, device)
+        super().__init__(policy, groups, settings.hyperparameters, env_runner, generator, device)
 
     def update(self, progress: float) -> Mapping[str, float]:
         """See `Algorithm.update`."""
-        rollout = self._take_rollout()
+        rollout = self._pop_rollout()
         schedules = self._set_schedules(progress)
         advantages = normalize(rollout.advantages)
         averager = Averager()
@@ -85,7 +85,7 @@ class PPO(OnPolicyAlgorithm):
             if not self._epoch(rollout, advantages, schedules, averager):
                 break
         self.policy.update_statistics(rollout.vectors)
-        statistics = averager.take()
+        statistics = averager.pop_means()
         variance = explained_variance(rollout.returns, rollout.values)
         return statistics | schedules | {"Policy/Explained Variance": variance}
 
@@ -134,7 +134,7 @@ class PPO(OnPolicyAlgorithm):
             ):
                 if weight:  # the gradient of what weighs nothing costs as much as any
                     loss = loss + weight * term
-            self._descend(loss)
+            self._optimizer_step(loss)
             statistics |= {
                 "Losses/Policy Loss": policy_loss,
                 "Losses/Value Loss": value_loss,

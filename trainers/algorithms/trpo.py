@@ -25,7 +25,7 @@ from trainers.algorithms.conjugate_gradient import conjugate_gradient
 from trainers.algorithms.on_policy import OnPolicyAlgorithm, OnPolicyHyperparameters
 from trainers.algorithms.optimization import check_finite
 from trainers.algorithms.schedules import CONSTANT, Schedule
-from trainers.experience.env_runner import Interaction
+from trainers.experience.env_runner import EnvRunner
 from trainers.experience.returns import explained_variance, normalize
 from trainers.experience.rollout import Rollout
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
@@ -99,19 +99,19 @@ class TRPO(OnPolicyAlgorithm):
         self,
         factory: NetworkFactory,
         settings: TRPOSettings,
-        interaction: Interaction,
+        env_runner: EnvRunner,
         generator: torch.Generator,
         device: torch.device,
     ):
         self._hyperparameters = settings.hyperparameters
         policy = ActorCritic(factory, settings.network_settings).to(device)
         groups = (policy.critic_parameters(),)
-        super().__init__(policy, groups, settings.hyperparameters, interaction, generator, device)
+        super().__init__(policy, groups, settings.hyperparameters, env_runner, generator, device)
         self._theta = [p for p in policy.actor_parameters() if p.requires_grad]
 
     def update(self, progress: float) -> Mapping[str, float]:
         """See `Algorithm.update`."""
-        rollout = self._take_rollout()
+        rollout = self._pop_rollout()
         schedules = self._set_schedules(progress)
         statistics = self._improve_policy(rollout, schedules["Policy/Delta"])
         statistics |= self._fit_critic(rollout)
@@ -129,7 +129,7 @@ class TRPO(OnPolicyAlgorithm):
 
     def _improve_policy(self, rollout: Rollout, delta: float) -> dict[str, float]:
         hyper = self._hyperparameters
-        rows = rollout.in_groups()
+        rows = rollout.in_shuffle_groups()
         observations = rollout.observations(rows)
         actions, log_probs = rollout.actions[rows], rollout.log_probs[rows]
         advantages = normalize(rollout.advantages)[rows]
@@ -140,7 +140,7 @@ class TRPO(OnPolicyAlgorithm):
         distribution = self.policy.distribution(observations)
         gain, old = gain_of(distribution), distribution.detach()
         gradient = flat_gradient(gain, self._theta)
-        check_finite(-gain, gradient.norm(), self._interaction.step_count)
+        check_finite(-gain, gradient.norm(), self._env_runner.step_count)
 
         def measure() -> tuple[Tensor, Tensor]:
             new = self.policy.distribution(observations)
@@ -185,9 +185,9 @@ class TRPO(OnPolicyAlgorithm):
             for rows in rollout.minibatches(hyper.batch_size, self._generator):
                 values = self.policy.value(rollout.observations(rows))
                 loss = F.mse_loss(values, rollout.returns[rows])
-                self._descend(loss)
+                self._optimizer_step(loss)
                 averager.add({"Losses/Value Loss": loss.item()}, len(rows))
-        return averager.take()
+        return averager.pop_means()
 
 
 def surrogate_gain(

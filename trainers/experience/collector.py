@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from trainers.common.timers import timed
-from trainers.experience.env_runner import Interaction, Step
+from trainers.experience.env_runner import EnvRunner, Step
 from trainers.experience.returns import gae
 from trainers.experience.reward_normalizer import RewardNormalizer
 from trainers.experience.rollout import FrameStore, Rollout, frame_spaces
@@ -29,7 +29,7 @@ class OnPolicyCollector:
 
     Args:
         policy: draws the actions and values the observations.
-        interaction: the environments.
+        env_runner: the environments.
         steps: T.
         generator: the source of the actions' randomness.
         device: where the policy lives.
@@ -39,16 +39,16 @@ class OnPolicyCollector:
     def __init__(
         self,
         policy: ActorCritic,
-        interaction: Interaction,
+        env_runner: EnvRunner,
         steps: int,
         generator: torch.Generator,
         device: torch.device,
         reward_normalizer: RewardNormalizer | None = None,
     ):
-        self._policy, self._interaction, self._steps = policy, interaction, steps
+        self._policy, self._env_runner, self._steps = policy, env_runner, steps
         self._generator, self._device = generator, device
         self._reward_normalizer = reward_normalizer
-        env = interaction.env
+        env = env_runner.env
         self._space, self._action_space = env.single_observation_space, env.single_action_space
         self._remembered = policy.initial_state(env.num_envs)
 
@@ -59,9 +59,9 @@ class OnPolicyCollector:
         Raises:
             NonFiniteError: a reward or an observation is NaN or infinite.
         """
-        frames = _Frames(self._policy, self._interaction, self._steps, self._device)
+        frames = _Frames(self._policy, self._env_runner, self._steps, self._device)
         moments = [self._play(frames) for _ in range(self._steps)]
-        last = self._tensors(self._interaction.observations, self._remembered)
+        last = self._tensors(self._env_runner.observations, self._remembered)
         advantages, returns = self._estimate(moments, self._policy.value(last), gamma, lambd)
         frame_index = torch.cat([moment.frame_index for moment in moments])
         actions = torch.cat([moment.actions for moment in moments])
@@ -70,7 +70,7 @@ class OnPolicyCollector:
         return Rollout(
             frames=frames.tensors(),
             frame_index=frame_index,
-            groups=self._sequences(moments) if self._policy.state_size else frame_index,
+            shuffle_groups=self._sequences(moments) if self._policy.state_size else frame_index,
             states=torch.cat([moment.state for moment in moments]),
             vectors={
                 name: torch.cat([moment.vectors[name] for moment in moments])
@@ -99,13 +99,13 @@ class OnPolicyCollector:
 
     def _play(self, frames: _Frames) -> _Moment:
         """Acts once in every environment."""
-        raw, state = self._interaction.observations, self._remembered
+        raw, state = self._env_runner.observations, self._remembered
         frame_index = frames.look(raw)
         with timed("act"):
             observations = self._tensors(frames.without(raw), state)
             distribution, values, after = self._policy.step(observations, frames.features)
             actions = distribution.sample(self._generator)
-        step = self._interaction.step(to_environment(actions, self._action_space))
+        step = self._env_runner.step(to_environment(actions, self._action_space))
         frames.new = np.flatnonzero(~step.same_frame)
         if self._policy.state_size:
             self._remembered = after.masked_fill(self._tensor(step.done)[:, None], 0.0)
@@ -217,11 +217,11 @@ class _Frames:
     """
 
     def __init__(
-        self, policy: ActorCritic, interaction: Interaction, steps: int, device: torch.device
+        self, policy: ActorCritic, env_runner: EnvRunner, steps: int, device: torch.device
     ):
         self._policy, self._device = policy, device
-        self._space = interaction.env.single_observation_space
-        self._count = interaction.env.num_envs
+        self._space = env_runner.env.single_observation_space
+        self._count = env_runner.env.num_envs
         spaces = frame_spaces(self._space)
         self.names = frozenset(spaces)
         self._store = FrameStore(spaces, steps * self._count, device)

@@ -49,52 +49,55 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Episodes:
+class EpisodeBatch:
     """k finished episodes, in the order they ended.
 
     Attributes:
         rewards: (k,) cumulative rewards.
         lengths: (k,) steps.
         terms: (k,) cumulative weighted rewards by term.
-        measures: (k,) what the environment reports of an episode, by name.
+        episode_metrics: (k,) what the environment reports of an episode, by name.
     """
 
     rewards: NDArray[np.float64]
     lengths: NDArray[np.float64]
     terms: dict[str, NDArray[np.float64]]
-    measures: dict[str, NDArray[np.float64]]
+    episode_metrics: dict[str, NDArray[np.float64]]
 
     def __len__(self) -> int:
         return len(self.rewards)
 
-    def __getitem__(self, rows: NDArray[np.bool_]) -> Episodes:
-        return Episodes(
+    def __getitem__(self, rows: NDArray[np.bool_]) -> EpisodeBatch:
+        return EpisodeBatch(
             self.rewards[rows],
             self.lengths[rows],
             {name: values[rows] for name, values in self.terms.items()},
-            {name: values[rows] for name, values in self.measures.items()},
+            {name: values[rows] for name, values in self.episode_metrics.items()},
         )
 
     @property
     def successes(self) -> NDArray[np.bool_]:
         """(k,) False where the environment does not report success."""
-        return self.measures.get(SUCCESS, np.zeros(len(self))).astype(bool)
+        return self.episode_metrics.get(SUCCESS, np.zeros(len(self))).astype(bool)
 
 
-def concatenate(parts: Sequence[Episodes]) -> Episodes:
-    """Episodes of several batches, in their order."""
+def concatenate(parts: Sequence[EpisodeBatch]) -> EpisodeBatch:
+    """EpisodeBatch of several batches, in their order."""
     parts = [part for part in parts if len(part)]
     if not parts:
-        return Episodes(np.zeros(0), np.zeros(0), {}, {})
-    return Episodes(
+        return EpisodeBatch(np.zeros(0), np.zeros(0), {}, {})
+    return EpisodeBatch(
         np.concatenate([part.rewards for part in parts]),
         np.concatenate([part.lengths for part in parts]),
         {name: np.concatenate([part.terms[name] for part in parts]) for name in parts[0].terms},
-        {n: np.concatenate([part.measures[n] for part in parts]) for n in parts[0].measures},
+        {
+            n: np.concatenate([part.episode_metrics[n] for part in parts])
+            for n in parts[0].episode_metrics
+        },
     )
 
 
-class Interaction:
+class EnvRunner:
     """Steps the environments, checks what they return, and adds up the episodes.
 
     Args:
@@ -113,7 +116,7 @@ class Interaction:
         self._reward = np.zeros(env.num_envs)
         self._length = np.zeros(env.num_envs)
         self._terms: dict[str, NDArray[np.float64]] = {}
-        self._finished: list[Episodes] = []
+        self._finished: list[EpisodeBatch] = []
 
     def reset(self) -> None:
         """Begins an episode everywhere."""
@@ -140,7 +143,7 @@ class Interaction:
         done = terminated | truncated
         final = infos.get("final_obs") if done.any() else None
         self._check_observations(final or {}, done)
-        self._add_up(reward, terms, infos.get("measures", {}), done)
+        self._add_up(reward, terms, infos.get("episode_metrics", {}), done)
         self.observations = observations
         return Step(
             reward,
@@ -150,7 +153,7 @@ class Interaction:
             final,
         )
 
-    def take_finished(self) -> Episodes:
+    def pop_finished(self) -> EpisodeBatch:
         """The episodes that ended since the last call."""
         parts, self._finished = self._finished, []
         return concatenate(parts)
@@ -185,7 +188,7 @@ class Interaction:
         self,
         reward: NDArray[np.float64],
         terms: Mapping[str, NDArray[np.float64]],
-        measures: Mapping[str, NDArray[Any]],
+        episode_metrics: Mapping[str, NDArray[Any]],
         done: NDArray[np.bool_],
     ) -> None:
         self._reward += reward
@@ -194,11 +197,11 @@ class Interaction:
             self._terms[name] = self._terms.get(name, 0.0) + values
         if done.any():
             self._finished.append(
-                Episodes(
+                EpisodeBatch(
                     self._reward[done],
                     self._length[done],
                     {name: total[done] for name, total in self._terms.items()},
-                    {name: np.asarray(v, np.float64)[done] for name, v in measures.items()},
+                    {name: np.asarray(v, np.float64)[done] for name, v in episode_metrics.items()},
                 )
             )
             for total in (self._reward, self._length, *self._terms.values()):

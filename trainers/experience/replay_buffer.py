@@ -31,7 +31,7 @@ _Kind = tuple[tuple[int, ...], np.dtype[Any]]
 class ReplayBuffer:
     """The latest transitions of N environments.
 
-    Transitions are named by *places*, integers (B,) as `sample` draws them.
+    Transitions are named by *indices*, integers (B,) as `sample` draws them.
 
     Args:
         space: of one environment's observations.
@@ -96,7 +96,7 @@ class ReplayBuffer:
             step: what came of them.
             following: (N, ...) after the step, of new episodes where one ended.
         """
-        here = self._places(self._row)
+        here = self._row_indices(self._row)
         if not self._length:
             self._frame[here] = self._frames.add(observations, np.arange(self._num_envs))
             self._keep_vectors(here, observations)
@@ -105,7 +105,7 @@ class ReplayBuffer:
         self._done[here] = step.done
         self._keep_final(here, observations, step)
         self._row = (self._row + 1) % self._rows
-        there = self._places(self._row)
+        there = self._row_indices(self._row)
         if self._length == self._steps:
             self._release(there)
         else:
@@ -116,29 +116,29 @@ class ReplayBuffer:
         self._frame[there][new] = self._frames.add(following, new)
 
     def sample(self, count: int, generator: torch.Generator) -> NDArray[np.int64]:
-        """Draws transitions, each as likely as any other: their places (count,)."""
+        """Draws transitions, each as likely as any other: their indices (count,)."""
         drawn = torch.randint(
             len(self), (count,), generator=generator, device=generator.device
         ).cpu()
         oldest = (self._row - self._length) * self._num_envs
-        places: NDArray[np.int64] = (oldest + drawn.numpy()) % len(self._rewards)
-        return places
+        indices: NDArray[np.int64] = (oldest + drawn.numpy()) % len(self._rewards)
+        return indices
 
-    def observations(self, places: NDArray[np.int64], names: Collection[str]) -> Observations:
+    def observations(self, indices: NDArray[np.int64], names: Collection[str]) -> Observations:
         """What was seen before the transitions, as far as it is asked for by name."""
-        vectors = {k: values[places] for k, values in self._vectors.items() if k in names}
-        return self._tensors(vectors, self._frame[places], names)
+        vectors = {k: values[indices] for k, values in self._vectors.items() if k in names}
+        return self._tensors(vectors, self._frame[indices], names)
 
-    def actions(self, places: NDArray[np.int64]) -> Tensor:
+    def actions(self, indices: NDArray[np.int64]) -> Tensor:
         """What was done, (B, A)."""
-        return self._to_device(self._actions[places])
+        return self._to_device(self._actions[indices])
 
-    def rewards(self, places: NDArray[np.int64]) -> Tensor:
+    def rewards(self, indices: NDArray[np.int64]) -> Tensor:
         """What was paid for it at once, (B,)."""
-        return self._to_device(self._rewards[places])
+        return self._to_device(self._rewards[indices])
 
     def returns(
-        self, places: NDArray[np.int64], gamma: float, steps: int
+        self, indices: NDArray[np.int64], gamma: float, steps: int
     ) -> tuple[Tensor, Tensor, NDArray[np.int64]]:
         """Returns of up to n steps, within the episode and within what is known.
 
@@ -146,16 +146,16 @@ class ReplayBuffer:
         ends or the newest transition is reached before.
 
         Args:
-            places: of the first transitions, (B,).
+            indices: of the first transitions, (B,).
             gamma: discount per step.
             steps: n, at least 1.
 
         Returns:
             R (B,); the discount (B,) of the value of what follows: gamma^k, or 0 where the episode
-            terminated; and the places (B,) of the last transitions of the returns.
+            terminated; and the indices (B,) of the last transitions of the returns.
         """
-        last, total = places, self._rewards[places]
-        discount = np.full(len(places), gamma, np.float32)
+        last, total = indices, self._rewards[indices]
+        discount = np.full(len(indices), gamma, np.float32)
         for power in range(1, steps):
             following = self._after(last)
             unknown = following // self._num_envs == self._row
@@ -166,14 +166,14 @@ class ReplayBuffer:
         discount[self._terminated[last]] = 0.0
         return self._to_device(total), self._to_device(discount), last
 
-    def next_observations(self, places: NDArray[np.int64], names: Collection[str]) -> Observations:
+    def next_observations(self, indices: NDArray[np.int64], names: Collection[str]) -> Observations:
         """What was seen after the transitions: where an episode was cut off, its last observation.
 
         Where it terminated, there is nothing to see that has a value; it is some observation.
         """
-        following = self._after(places)
+        following = self._after(indices)
         vectors = {k: values[following] for k, values in self._vectors.items() if k in names}
-        frame, final = self._frame[following], self._final[places]
+        frame, final = self._frame[following], self._final[indices]
         cut = np.flatnonzero(final != NONE)
         if len(cut):
             kept = self._finals.take(final[cut], (_FRAME, *vectors))
@@ -221,47 +221,47 @@ class ReplayBuffer:
             "final": self._final,
         }
 
-    def _places(self, row: int) -> slice:
+    def _row_indices(self, row: int) -> slice:
         row %= self._rows
         return slice(row * self._num_envs, (row + 1) * self._num_envs)
 
-    def _after(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The places of the next row."""
-        following: NDArray[np.int64] = (places + self._num_envs) % len(self._rewards)
+    def _after(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The indices of the next row."""
+        following: NDArray[np.int64] = (indices + self._num_envs) % len(self._rewards)
         return following
 
-    def _keep_vectors(self, places: slice, observations: Mapping[str, NDArray[Any]]) -> None:
+    def _keep_vectors(self, indices: slice, observations: Mapping[str, NDArray[Any]]) -> None:
         for name, values in self._vectors.items():
-            values[places] = observations[name]
+            values[indices] = observations[name]
 
     def _keep_final(
-        self, places: slice, observations: Mapping[str, NDArray[Any]], step: Step
+        self, indices: slice, observations: Mapping[str, NDArray[Any]], step: Step
     ) -> None:
         """Keeps the last observations of episodes that were cut off; their images if they differ.
 
         What terminated has nothing after it that a learner could want to know the value of.
         """
         cut = np.flatnonzero(step.truncated & ~step.terminated)
-        self._final[places] = NONE
+        self._final[indices] = NONE
         if not len(cut):
             return
         if step.final_observations is None:
             raise ValueError("an episode was truncated, and the infos have no `final_obs`")
         final = step.final_observations
-        frame = self._frame[places].copy()
+        frame = self._frame[indices].copy()
         differ = frames_differ(final, observations, self._frames.names, cut)
         frame[cut[differ]] = self._frames.add(final, cut[differ])
-        self._final[places][cut] = self._finals.add({**final, _FRAME: frame}, cut)
+        self._final[indices][cut] = self._finals.add({**final, _FRAME: frame}, cut)
 
-    def _release(self, places: slice) -> None:
+    def _release(self, indices: slice) -> None:
         """Gives back the slots that nothing but a row's transitions refers to."""
-        frame, final = self._frame[places], self._final[places]
+        frame, final = self._frame[indices], self._final[indices]
         cut = np.flatnonzero(final != NONE)
         if len(cut):
             kept = self._finals.take(final[cut], (_FRAME,))[_FRAME]
             self._frames.release(kept[kept != frame[cut]])
             self._finals.release(final[cut])
-        following = self._frame[self._places(places.start // self._num_envs + 1)]
+        following = self._frame[self._row_indices(indices.start // self._num_envs + 1)]
         self._frames.release(frame[frame != following])
 
     def _tensors(

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from trainers.networks.observations import Observations, is_frame, take
+from trainers.networks.observations import Observations, gather, is_frame
 from trainers.networks.recurrent import Sequences
 
 
@@ -62,8 +62,8 @@ class Rollout:
         frames: by name, (U, H, W, C).
         frame_index: which of the U frames belongs to each transition.
         vectors: by name, (M, n).
-        groups: the number, from 0, of the group that each belongs to, which stays together: the
-            transitions of one frame or, of a policy with memory, those of one sequence.
+        shuffle_groups: the number, from 0, of the group that each belongs to, which stays
+            together: the transitions of one frame or, of a policy with memory, of one sequence.
         states: (M, m) what the policy remembered before each; m is 0 without memory.
         actions: as the policy drew them, before any clipping.
         log_probs: of the actions under the policy that drew them.
@@ -75,7 +75,7 @@ class Rollout:
     frames: dict[str, Tensor]
     frame_index: Tensor
     vectors: dict[str, Tensor]
-    groups: Tensor
+    shuffle_groups: Tensor
     states: Tensor
     actions: Tensor
     log_probs: Tensor
@@ -90,7 +90,7 @@ class Rollout:
         """Observations of some transitions, with the frames they share once.
 
         Args:
-            rows: (B,) in an order that `minibatches` or `in_groups` gives.
+            rows: (B,) in an order that `minibatches` or `in_shuffle_groups` gives.
         """
         chosen, index = self._frames_of(rows)
         vectors = {name: values[rows] for name, values in self.vectors.items()}
@@ -100,7 +100,7 @@ class Rollout:
         """The sequences that some rows make up; None where nothing is remembered."""
         if not self.states.shape[1]:
             return None
-        _, lengths = self.groups[rows].unique_consecutive(return_counts=True)
+        _, lengths = self.shuffle_groups[rows].unique_consecutive(return_counts=True)
         first = rows[lengths.cumsum(0) - lengths]
         return Sequences(lengths.cpu(), self.states[first])
 
@@ -112,11 +112,11 @@ class Rollout:
         distinct, place = frames.unique(return_inverse=True)
         if len(distinct) < len(frames):
             frames, index = distinct, place
-        return {name: take(tensor, frames) for name, tensor in self.frames.items()}, index
+        return {name: gather(tensor, frames) for name, tensor in self.frames.items()}, index
 
-    def in_groups(self) -> Tensor:
+    def in_shuffle_groups(self) -> Tensor:
         """All rows (M,), those of one group side by side and in the order of time."""
-        return self.groups.argsort(stable=True)
+        return self.shuffle_groups.argsort(stable=True)
 
     def minibatches(self, size: int, generator: torch.Generator) -> Iterator[Tensor]:
         """Splits all transitions at random into parts of `size` rows; the last may be smaller.
@@ -125,10 +125,10 @@ class Rollout:
         pass, and a sequence is cut at most where a part ends. Where every transition is a group of
         its own, this is a plain random split.
         """
-        count = int(self.groups.max()) + 1
-        device = self.groups.device
+        count = int(self.shuffle_groups.max()) + 1
+        device = self.shuffle_groups.device
         place = torch.randperm(count, generator=generator, device=device)
-        order = torch.argsort(place[self.groups], stable=True)
+        order = torch.argsort(place[self.shuffle_groups], stable=True)
         yield from order.split(size)
 
 

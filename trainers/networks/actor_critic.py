@@ -130,10 +130,12 @@ class ActorCritic(nn.Module):
         """The distribution of actions, the values (B,), and the state (S, state_size) after."""
         known = features or FrameFeatures(None, None)
         seen_by_actor, seen_by_critic = self._split(observations)
-        hidden, state = self.actor.recall(seen_by_actor, known.actor)
+        hidden, state = self.actor.forward_recurrent(seen_by_actor, known.actor)
         distribution, critic_hidden = self._distribution(hidden), hidden
         if self.critic is not None:
-            critic_hidden, critic_state = self.critic.recall(seen_by_critic, known.critic)
+            critic_hidden, critic_state = self.critic.forward_recurrent(
+                seen_by_critic, known.critic
+            )
             state = torch.cat([state, critic_state], dim=1)
         return distribution, self._value(critic_hidden), state
 

@@ -139,7 +139,7 @@ class DeterministicPolicy(nn.Module):
         """Actions in [-1, 1] as the environment's space has them."""
         return self._low + (actions + 1.0) / 2.0 * (self._high - self._low)
 
-    def follow(self) -> None:
+    def update_targets(self) -> None:
         """Moves the targets towards what learns: target += tau (online - target)."""
         self._average(*self._pairs, 0)
 

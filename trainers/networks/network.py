@@ -102,10 +102,10 @@ class Network(nn.Module):
             return (features if self.vector_encoders else self.trunk(features)).float()
 
     def forward(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
-        """Hidden vectors (B, features_dim) alone; see `recall`."""
-        return self.recall(observations, frame_features)[0]
+        """Hidden vectors (B, features_dim) alone; see `forward_recurrent`."""
+        return self.forward_recurrent(observations, frame_features)[0]
 
-    def recall(
+    def forward_recurrent(
         self, observations: Observations, frame_features: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Hidden vectors, and what is to be remembered.

@@ -60,7 +60,7 @@ def to_tensors(
     return Observations(frames, vectors)
 
 
-def take(tensor: Tensor, index: Tensor | tuple[Tensor, ...]) -> Tensor:
+def gather(tensor: Tensor, index: Tensor | tuple[Tensor, ...]) -> Tensor:
     """Entries of a tensor of any type."""
     # torch indexes uint16 through its signed twin, which has all the operations.
     if tensor.dtype == torch.uint16:

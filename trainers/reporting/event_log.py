@@ -121,7 +121,7 @@ class Averager:
             self._sums[name] = self._sums.get(name, 0.0) + float(value) * count
             self._counts[name] = self._counts.get(name, 0) + count
 
-    def take(self) -> dict[str, float]:
+    def pop_means(self) -> dict[str, float]:
         """The mean of each name that got a value; then start anew."""
         means = {name: total / self._counts[name] for name, total in self._sums.items()}
         self._sums, self._counts = {}, {}

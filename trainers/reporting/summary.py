@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from trainers.experience.env_runner import SUCCESS, Episodes
+from trainers.experience.env_runner import SUCCESS, EpisodeBatch
 from trainers.experience.rollout import frame_spaces
 from trainers.reporting.event_log import Averager, RunLog
 from trainers.reporting.images import picture
-from trainers.reporting.terminal import Progress, ProgressLine
+from trainers.reporting.terminal import RunStatus, TerminalDisplay
 from trainers.session import Session
 
 MEASURE_TAGS = {"success": "Success Rate", "collision": "Collision Rate"}
@@ -53,7 +53,7 @@ class Summary:
         """Adds the statistics of an update."""
         self._averager.add(statistics)
 
-    def add_episodes(self, episodes: Episodes) -> None:
+    def add_episodes(self, episodes: EpisodeBatch) -> None:
         """Adds finished episodes."""
         if not len(episodes):
             return
@@ -61,7 +61,10 @@ class Summary:
             "Environment/Cumulative Reward": episodes.rewards.mean(),
             "Environment/Episode Length": episodes.lengths.mean(),
             **{f"Reward/{name}": total.mean() for name, total in episodes.terms.items()},
-            **{measure_tag(name): values.mean() for name, values in episodes.measures.items()},
+            **{
+                measure_tag(name): values.mean()
+                for name, values in episodes.episode_metrics.items()
+            },
         }
         self._averager.add({name: float(mean) for name, mean in means.items()}, len(episodes))
 
@@ -69,9 +72,9 @@ class Summary:
         """Remembers the newest checkpoint, for status.json."""
         self._checkpoint = str(path)
 
-    def report(self, session: Session, progress: Progress) -> None:
+    def report(self, session: Session, progress: TerminalDisplay) -> None:
         """Writes a summary if one is due, and shows the terminal where the run stands."""
-        step = session.interaction.step_count
+        step = session.env_runner.step_count
         if step >= self._next_summary:
             self._next_summary = (step // self._summary_freq + 1) * self._summary_freq
             self._summarize(session, step)
@@ -84,7 +87,7 @@ class Summary:
             session: the run.
             state: `running`, `finished`, `interrupted` or `failed`.
         """
-        line = self._line(session, session.interaction.step_count)
+        line = self._line(session, session.env_runner.step_count)
         self._log.status(
             {
                 "run_id": self._run_id,
@@ -103,7 +106,7 @@ class Summary:
 
     def _summarize(self, session: Session, step: int) -> None:
         now = time.monotonic()
-        means = self._averager.take()
+        means = self._averager.pop_means()
         if step > self._summary_step:
             speed = (step - self._summary_step) / max(now - self._summary_s, 1e-9)
             means["Performance/Steps Per Second"] = speed
@@ -120,17 +123,17 @@ class Summary:
         self.status(session, "running")
 
     def _show_observations(self, session: Session, step: int) -> None:
-        interaction = session.interaction
-        spaces: Any = interaction.env.single_observation_space
+        env_runner = session.env_runner
+        spaces: Any = env_runner.env.single_observation_space
         for name, space in frame_spaces(spaces).items():
-            frame = np.asarray(interaction.observations[name][0])
+            frame = np.asarray(env_runner.observations[name][0])
             self._log.images(f"Observations/{name}", picture(space, frame), step)
 
-    def _line(self, session: Session, step: int) -> ProgressLine:
+    def _line(self, session: Session, step: int) -> RunStatus:
         elapsed_s = time.monotonic() - self._start_s
         overall = (step - self._start_step) / max(elapsed_s, 1e-9)
         left_s = (self._max_steps - step) / overall if overall > 0 else None
-        return ProgressLine(
+        return RunStatus(
             step=step,
             reward=self._last.get("Environment/Cumulative Reward"),
             lesson=session.lesson,

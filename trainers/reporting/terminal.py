@@ -21,7 +21,7 @@ _WIDEST_PANEL = 100
 
 
 @dataclass(frozen=True)
-class ProgressLine:
+class RunStatus:
     """Where a run stands.
 
     Attributes:
@@ -41,10 +41,10 @@ class ProgressLine:
     seconds_left: float | None = None
 
 
-class Progress(Protocol):
+class TerminalDisplay(Protocol):
     """Shows a run's progress; used as a context manager around the run."""
 
-    def update(self, line: ProgressLine) -> None:
+    def update(self, line: RunStatus) -> None:
         """Show where the run stands."""
 
     def message(self, text: str) -> None:
@@ -60,13 +60,13 @@ class Progress(Protocol):
     ) -> None: ...
 
 
-def make_progress(
+def make_display(
     run_id: str,
     max_steps: int,
     lesson_count: int,
     start_step: int = 0,
     console: Console | None = None,
-) -> Progress:
+) -> TerminalDisplay:
     """Choose the display that fits the console.
 
     Args:
@@ -78,7 +78,7 @@ def make_progress(
     """
     console = console or Console()
     live = console.is_terminal and not console.is_dumb_terminal
-    display = _LiveProgress if live else _PlainProgress
+    display = _LiveDisplay if live else _PlainDisplay
     return display(console, run_id, max_steps, lesson_count, start_step)
 
 
@@ -107,7 +107,7 @@ def format_duration(duration_s: float) -> str:
     return f"{seconds} s"
 
 
-class _Display:
+class _BaseDisplay:
     """What both displays have in common."""
 
     def __init__(
@@ -123,7 +123,7 @@ class _Display:
         """Print a line that stays."""
         self._console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
 
-    def _figures(self, line: ProgressLine) -> list[str]:
+    def _figures(self, line: RunStatus) -> list[str]:
         lesson = (
             [f"lesson {line.lesson + 1}/{self._lesson_count}"] if self._lesson_count > 1 else []
         )
@@ -140,7 +140,7 @@ class _Display:
         ]
 
 
-class _PlainProgress(_Display):
+class _PlainDisplay(_BaseDisplay):
     """One line per update, for logs, pipes and terminals that can't do more."""
 
     def __enter__(self) -> Self:
@@ -156,21 +156,21 @@ class _PlainProgress(_Display):
     ) -> None:
         pass
 
-    def update(self, line: ProgressLine) -> None:
+    def update(self, line: RunStatus) -> None:
         """Print one line."""
         position = f"{format_count(line.step)}/{format_count(self._max_steps)}"
         left = f"{_if_known(line.seconds_left, format_duration)} left"
         self.message("  ".join([position, *self._figures(line), left]))
 
 
-class _LiveProgress(_Display):
+class _LiveDisplay(_BaseDisplay):
     """A panel that stays at the foot of the terminal; messages scroll by above it."""
 
     def __init__(
         self, console: Console, run_id: str, max_steps: int, lesson_count: int, start_step: int
     ) -> None:
         super().__init__(console, run_id, max_steps, lesson_count, start_step)
-        first = self._panel(ProgressLine(step=start_step))
+        first = self._panel(RunStatus(step=start_step))
         self._live = Live(first, console=console, auto_refresh=False)
 
     def __enter__(self) -> Self:
@@ -185,11 +185,11 @@ class _LiveProgress(_Display):
     ) -> None:
         self._live.stop()
 
-    def update(self, line: ProgressLine) -> None:
+    def update(self, line: RunStatus) -> None:
         """Redraw the panel."""
         self._live.update(self._panel(line), refresh=True)
 
-    def _panel(self, line: ProgressLine) -> Panel:
+    def _panel(self, line: RunStatus) -> Panel:
         position = f"{format_count(line.step)} / {format_count(self._max_steps)}"
         # A run may overshoot by part of its last batch.
         share = min(1.0, line.step / max(1, self._max_steps))

@@ -15,7 +15,7 @@ REPORT = "evaluation.json"
 FILES = "files"
 
 
-class Gallery:
+class EvaluationFolder:
     """Files that one evaluation writes, and the next one may replace.
 
     Which files are its own is written in the report beside them.

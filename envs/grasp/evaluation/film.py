@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from envs.grasp.evaluation.pick import STEP_S, Attempt, Picker
-from envs.grasp.evaluation.pose_errors import Shot
+from envs.grasp.evaluation.pose_errors import Sample
 from envs.grasp.sensors.camera import overviews
 from envs.grasp.settings import Pick, Support
 
@@ -26,8 +26,8 @@ LIGHT = {
 }
 
 
-def film(shots: Sequence[Shot], support: Support, settings: Pick, pick: bool) -> bytes:
-    """Films some aims one after the other, from the robot's home on.
+def film(shots: Sequence[Sample], support: Support, settings: Pick, pick: bool) -> bytes:
+    """Films some commands one after the other, from the robot's home on.
 
     Args:
         shots: what to film, one or more.

@@ -16,7 +16,7 @@ import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
-from envs.grasp.evaluation.pose_commands import Aims
+from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.robot.kinematics import (
     InverseKinematics,
     grasp_pose,
@@ -25,7 +25,7 @@ from envs.grasp.robot.kinematics import (
 )
 from envs.grasp.robot.urdf import HOME_JOINTS_RAD, load_robot
 from envs.grasp.scene.sampler import Scenes, to_world
-from envs.grasp.sensors.camera import Views
+from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Pick, Support
 from envs.grasp.simulators.base import Floats, Images
 from envs.grasp.simulators.bodies import (
@@ -144,24 +144,24 @@ class Picker:
 
 
 class PickCheck:
-    """Picks at the aims of actions. Implements `envs.environment.PhysicalCheck`.
+    """Picks at the commands of actions. Implements `envs.environment.PhysicalCheck`.
 
     Args:
         picker: carries them out; it is closed with this.
-        aims: where actions would lead in the running episodes.
+        commands: where actions would lead in the running episodes.
     """
 
-    def __init__(self, picker: Picker, aims: Callable[[NDArray[Any]], Aims]):
-        self._picker, self._aims = picker, aims
+    def __init__(self, picker: Picker, commands: Callable[[NDArray[Any]], PoseCommands]):
+        self._picker, self._pose_commands = picker, commands
 
     def __call__(self, actions: NDArray[Any]) -> dict[str, NDArray[np.bool_]]:
         """See `PhysicalCheck`; the names are those of `Outcome`."""
-        aims = self._aims(actions)
+        commands = self._pose_commands(actions)
         outcomes = np.array(
             [
-                self._picker.pick(aims.scenes[row : row + 1], tooltip_m, float(yaw_rad))
+                self._picker.pick(commands.scenes[row : row + 1], tooltip_m, float(yaw_rad))
                 for row, (tooltip_m, yaw_rad) in enumerate(
-                    zip(aims.tooltip_m, aims.yaw_rad, strict=True)
+                    zip(commands.tooltip_m, commands.yaw_rad, strict=True)
                 )
             ]
         )
@@ -268,7 +268,7 @@ class Attempt:
         )
         return pose
 
-    def picture(self, views: Views) -> Images:
+    def picture(self, views: CameraPoses) -> Images:
         """What an RGB camera, the first of the views, sees now: (H, W, 3)."""
         view, projection = view_matrices(views)[0], projection_matrices(views)[0]
         return take_picture(self._id, self._scene, views.camera, view, projection)[0]

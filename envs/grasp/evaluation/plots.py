@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from envs.grasp.evaluation.pick import CUP_RADIUS_M, Outcome
-from envs.grasp.evaluation.pose_errors import Judged, Shot, outcome_label
+from envs.grasp.evaluation.pose_errors import PoseErrors, Sample, outcome_label
 from envs.grasp.scene.sampler import heading
 from envs.grasp.sensors.camera import project
 from envs.grasp.settings import Goal
@@ -41,7 +41,7 @@ FARTHEST_PERCENTILE = 97.0
 DPI = 110
 
 
-def contact_sheet(shots: Sequence[Shot], goal_m: Floats) -> bytes:
+def contact_sheet(shots: Sequence[Sample], goal_m: Floats) -> bytes:
     """What the camera saw, with the cup drawn at the goal and where the policy sent it.
 
     Args:
@@ -69,8 +69,8 @@ def contact_sheet(shots: Sequence[Shot], goal_m: Floats) -> bytes:
     return _png(figure)
 
 
-def error_histograms(judged: Judged, goal: Goal) -> bytes:
-    """Signed errors of the aims, in the block frame, with the goal region shaded."""
+def error_histograms(judged: PoseErrors, goal: Goal) -> bytes:
+    """Signed errors of the commands, in the block frame, with the goal region shaded."""
     half_gap_mm = (goal.gap_limit_m - goal.gap_min_m) / 2 * 1000.0
     lateral, vertical, gap = judged.error_m.T * 1000.0
     panels = (
@@ -95,7 +95,7 @@ def error_histograms(judged: Judged, goal: Goal) -> bytes:
     return _png(figure)
 
 
-def workspace(judged: Judged) -> bytes:
+def workspace(judged: PoseErrors) -> bytes:
     """Where on the support, and at which yaw, the errors are."""
     figure = Figure(figsize=(11.0, 4.4), layout="constrained")
     above, turned = figure.subplots(1, 2, width_ratios=(1.3, 1.0))
@@ -142,7 +142,7 @@ def _show(axes: Axes, image: NDArray[Any]) -> None:
     axes.set(xlim=(0, width), ylim=(height, 0))
 
 
-def _draw_cup(axes: Axes, shot: Shot, tooltip_m: Floats, yaw_rad: float, color: str) -> None:
+def _draw_cup(axes: Axes, shot: Sample, tooltip_m: Floats, yaw_rad: float, color: str) -> None:
     """Draws the cup's rim, and its axis back towards the robot."""
     angle = np.linspace(0.0, 2.0 * math.pi, RIM_POINTS)[:, None]
     ahead, up = heading(np.array(yaw_rad)), np.array([0.0, 0.0, 1.0])

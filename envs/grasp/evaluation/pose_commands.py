@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import Views
+from envs.grasp.sensors.camera import CameraPoses
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Aims:
+class PoseCommands:
     """n commanded poses, and what they were chosen before.
 
     Attributes:
@@ -29,7 +29,7 @@ class Aims:
     scenes: Scenes
     tooltip_m: Floats
     yaw_rad: Floats
-    views: dict[str, Views]
+    views: dict[str, CameraPoses]
     images: dict[str, NDArray[Any]]
 
     def __len__(self) -> int:

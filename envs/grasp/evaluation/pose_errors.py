@@ -1,4 +1,4 @@
-"""Aims as they are judged and drawn."""
+"""PoseCommands as they are judged and drawn."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from envs.grasp.evaluation.pick import Outcome
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import Views
+from envs.grasp.sensors.camera import CameraPoses
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Judged:
-    """How far n aims are off, and where.
+class PoseErrors:
+    """How far n commands are off, and where.
 
     Attributes:
         target_m: (n, 3) grasp points, world frame.
@@ -40,15 +40,15 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class Shot:
+class Sample:
     """One aim to be drawn by itself: one row of scene and view, its image, and its judgement."""
 
     scene: Scenes
-    view: Views
+    view: CameraPoses
     image: NDArray[Any]
     tooltip_m: Floats
     yaw_rad: float
-    judged: Judged
+    judged: PoseErrors
 
     @property
     def caption(self) -> str:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.grasp.evaluation.pose_commands import Aims
-from envs.grasp.evaluation.pose_errors import Judged, Shot
+from envs.grasp.evaluation.pose_commands import PoseCommands
+from envs.grasp.evaluation.pose_errors import PoseErrors, Sample
 from envs.grasp.settings import GraspSettings
 from envs.grasp.task import block_offset, goal_middle_m, yaw_error
 
@@ -21,12 +21,12 @@ FILMED = 4
 NEEDED = ("matplotlib", "PIL")
 
 
-class GraspAlbum:
-    """Draws aims. Implements `envs.environment.Album`.
+class GraspReport:
+    """Draws commands. Implements `envs.environment.EvaluationReport`.
 
     Args:
         settings: the task.
-        aims: where actions would lead in the running episodes.
+        commands: where actions would lead in the running episodes.
 
     Raises:
         ValueError: a package is missing.
@@ -34,33 +34,33 @@ class GraspAlbum:
 
     file_names: tuple[str, ...] = ("episodes.png", "errors.png", "workspace.png", "film.gif")
 
-    def __init__(self, settings: GraspSettings, aims: Callable[[NDArray[Any]], Aims]):
+    def __init__(self, settings: GraspSettings, commands: Callable[[NDArray[Any]], PoseCommands]):
         if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
             raise ValueError(
                 f"pictures are drawn with {missing[0]}, which is not installed: install ventosa "
                 "with its extra `render`, pip install -e '.[render]'"
             )
-        self._settings, self._aims = settings, aims
+        self._settings, self._pose_commands = settings, commands
         cameras = settings.cameras
         depth = [name for name, camera in cameras.items() if camera.type == "depth"]
         self._camera = (depth or list(cameras))[0]
-        self._judged: list[Judged] = []
-        self._shots: list[Shot] = []
+        self._judged: list[PoseErrors] = []
+        self._shots: list[Sample] = []
         self._picked = False
 
     def add(self, actions: NDArray[Any], outcomes: Mapping[str, NDArray[np.bool_]]) -> None:
-        """See `Album`."""
-        aims = self._aims(actions)
-        judged = self._judge(aims, outcomes)
+        """See `EvaluationReport`."""
+        commands = self._pose_commands(actions)
+        judged = self._judge(commands, outcomes)
         self._judged.append(judged)
         self._picked = bool(outcomes)
         self._shots += [
-            self._shot(aims, judged, slice(row, row + 1))
-            for row in range(min(len(aims), SHOWN - len(self._shots)))
+            self._shot(commands, judged, slice(row, row + 1))
+            for row in range(min(len(commands), SHOWN - len(self._shots)))
         ]
 
     def files(self) -> Iterator[tuple[str, bytes]]:
-        """See `Album`."""
+        """See `EvaluationReport`."""
         # Imported late: they need what an installation without pictures does not have.
         from envs.grasp.evaluation.film import film  # noqa: PLC0415
         from envs.grasp.evaluation.plots import contact_sheet, error_histograms, workspace  # noqa: PLC0415
@@ -72,32 +72,34 @@ class GraspAlbum:
         yield places, workspace(judged)
         yield moving, film(self._shots[:FILMED], settings.support, settings.pick, self._picked)
 
-    def _judge(self, aims: Aims, outcomes: Mapping[str, NDArray[np.bool_]]) -> Judged:
-        target_m, target_yaw_rad = aims.scenes.target_m, aims.scenes.target_yaw_rad
-        offset_m = block_offset(aims.tooltip_m, target_m, target_yaw_rad)
-        names = np.full(len(aims), "", dtype="<U32")
+    def _judge(
+        self, commands: PoseCommands, outcomes: Mapping[str, NDArray[np.bool_]]
+    ) -> PoseErrors:
+        target_m, target_yaw_rad = commands.scenes.target_m, commands.scenes.target_yaw_rad
+        offset_m = block_offset(commands.tooltip_m, target_m, target_yaw_rad)
+        names = np.full(len(commands), "", dtype="<U32")
         for name, rows in outcomes.items():
             names[rows] = name
-        return Judged(
+        return PoseErrors(
             target_m=target_m,
             target_yaw_deg=np.degrees(target_yaw_rad),
             error_m=offset_m - goal_middle_m(self._settings.goal),
-            yaw_error_deg=np.degrees(yaw_error(aims.yaw_rad, target_yaw_rad)),
+            yaw_error_deg=np.degrees(yaw_error(commands.yaw_rad, target_yaw_rad)),
             outcome=names,
         )
 
-    def _shot(self, aims: Aims, judged: Judged, row: slice) -> Shot:
-        return Shot(
-            scene=aims.scenes[row],
-            view=aims.views[self._camera][row],
-            image=aims.images[self._camera][row][0],
-            tooltip_m=aims.tooltip_m[row][0],
-            yaw_rad=float(aims.yaw_rad[row][0]),
-            judged=Judged(**{name: values[row] for name, values in vars(judged).items()}),
+    def _shot(self, commands: PoseCommands, judged: PoseErrors, row: slice) -> Sample:
+        return Sample(
+            scene=commands.scenes[row],
+            view=commands.views[self._camera][row],
+            image=commands.images[self._camera][row][0],
+            tooltip_m=commands.tooltip_m[row][0],
+            yaw_rad=float(commands.yaw_rad[row][0]),
+            judged=PoseErrors(**{name: values[row] for name, values in vars(judged).items()}),
         )
 
 
-def _concatenate(parts: list[Judged]) -> Judged:
-    return Judged(
+def _concatenate(parts: list[PoseErrors]) -> PoseErrors:
+    return PoseErrors(
         **{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
     )

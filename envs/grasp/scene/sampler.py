@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from envs.grasp.batch import Batch
 from envs.grasp.scene.placement import place_blocks, rules
-from envs.grasp.sensors.camera import Views, sample_views
+from envs.grasp.sensors.camera import CameraPoses, sample_views
 from envs.grasp.settings import GraspSettings, Randomize
-from envs.grasp.simulators.thread_pool import Team
+from envs.grasp.simulators.thread_pool import ThreadPool
 
 Floats = NDArray[np.float64]
 
@@ -67,11 +67,11 @@ class SceneSampler:
     def __init__(self, settings: GraspSettings):
         self._settings = settings
         self._rules = rules(settings)
-        self._team = Team()
+        self._threads = ThreadPool()
 
     def sample(
         self, rng: np.random.Generator, yaw_limit_rad: Floats
-    ) -> tuple[Scenes, dict[str, Views]]:
+    ) -> tuple[Scenes, dict[str, CameraPoses]]:
         """Draws n scenes and where each of the cameras stands in them.
 
         Args:
@@ -113,7 +113,7 @@ class SceneSampler:
             scenes.target_m,
             found,
         )
-        self._team.share(place, n)
+        self._threads.parallel_for(place, n)
         if not found.all():
             raise SceneError(
                 f"no scene with {blocks} blocks fits: widen environment.randomize.block_x_m and "

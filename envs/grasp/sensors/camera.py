@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Views(Batch):
+class CameraPoses(Batch):
     """Where n cameras of one kind stand.
 
     Attributes:
@@ -89,12 +89,12 @@ def euler_rotations(angles_rad: Floats) -> Floats:
 
 def sample_views(
     camera: Camera, rng: np.random.Generator, n: int, position_m: float, rotation_deg: float
-) -> Views:
+) -> CameraPoses:
     """Places n cameras, moved by up to +-`position_m` and turned by `rotation_deg` per axis."""
     nominal = np.array(camera.position_m)
     nominal_rotation = look_at(nominal, np.array(camera.target_m), np.radians(camera.roll_deg))
     jitter = np.radians(rng.uniform(-rotation_deg, rotation_deg, (n, 3)))
-    return Views(
+    return CameraPoses(
         camera,
         nominal + rng.uniform(-position_m, position_m, (n, 3)),
         nominal_rotation @ euler_rotations(jitter),
@@ -104,13 +104,13 @@ def sample_views(
     )
 
 
-def overviews(n: int, **other: Any) -> Views:
+def overviews(n: int, **other: Any) -> CameraPoses:
     """The overview n times, never moved; `other` are fields of its `Camera` to have otherwise."""
     camera = OVERVIEW.model_copy(update=other)
     return sample_views(camera, np.random.default_rng(0), n, position_m=0.0, rotation_deg=0.0)
 
 
-def project(views: Views, points_m: Floats) -> Floats:
+def project(views: CameraPoses, points_m: Floats) -> Floats:
     """Pixel coordinates (n, k, 2) and depth of world points (n, k, 3), as (n, k, 3): u, v, z."""
     camera = views.camera
     local = (points_m - views.position_m[:, None]) @ views.rotation

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from encoders.spaces import DepthImage
 from envs.environment import EnvironmentFailure
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import Views
+from envs.grasp.sensors.camera import CameraPoses
 
 Indices = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -48,7 +48,7 @@ class Simulator(Protocol):
     def move(self, indices: Indices, path_rad: Floats) -> Contacts:
         """Moves n robots along joint poses (n, p, 6), and stays at the last one."""
 
-    def render(self, indices: Indices, views: Views) -> Images:
+    def render(self, indices: Indices, views: CameraPoses) -> Images:
         """Takes n pictures.
 
         Returns:
@@ -56,8 +56,8 @@ class Simulator(Protocol):
             RGB (n, H, W, 3) uint8, by the camera's type.
         """
 
-    def sense(
-        self, indices: Indices, views: Views, space: DepthImage, seeds: NDArray[np.uint64]
+    def render_depth(
+        self, indices: Indices, views: CameraPoses, space: DepthImage, seeds: NDArray[np.uint64]
     ) -> Images:
         """Takes n depth pictures as the sensor delivers them.
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from encoders.spaces import MM_PER_M, UINT8_MAX, DepthImage
 from envs.grasp.robot.urdf import Box, Robot, load_robot
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import Views, focal_length_px
+from envs.grasp.sensors.camera import CameraPoses, focal_length_px
 from envs.grasp.settings import Support
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
 from envs.grasp.simulators.colors import BLOCK_RGBA, SUPPORT_RGBA
@@ -25,7 +25,7 @@ from envs.grasp.simulators.kernels.pictures import (
     take_pictures,
 )
 from envs.grasp.simulators.kernels.worlds import RobotArrays, WorldArrays
-from envs.grasp.simulators.thread_pool import Team
+from envs.grasp.simulators.thread_pool import ThreadPool
 
 CUP = "cup"
 ORTHONORMAL_TOLERANCE = 1e-6
@@ -49,7 +49,7 @@ class FastSimulator:
     """
 
     def __init__(self, num_worlds: int, support: Support, threads: int | None = None):
-        self._team = Team(threads)
+        self._threads = ThreadPool(threads)
         self._robot = robot_arrays(load_robot())
         self._num_worlds, self._support = num_worlds, support
         self._worlds = _empty_worlds(num_worlds, 1, len(self._robot.axes))
@@ -98,11 +98,11 @@ class FastSimulator:
         touched, collided = np.zeros(len(indices), bool), np.zeros(len(indices), bool)
         path = np.ascontiguousarray(path_rad, np.float64)
         touch = partial(touch_along, self._robot, self._worlds, indices, path, touched, collided)
-        self._team.share(touch, len(indices))
+        self._threads.parallel_for(touch, len(indices))
         self._worlds.joints[indices, 0] = path[:, -1]
         return Contacts(touched, collided)
 
-    def render(self, indices: Indices, views: Views) -> Images:
+    def render(self, indices: Indices, views: CameraPoses) -> Images:
         """See `Simulator.render`.
 
         Raises:
@@ -116,10 +116,10 @@ class FastSimulator:
         self._take_pictures(indices, arrays, NO_SENSOR, depths, colors, NO_CODES)
         return colors if is_color else depths
 
-    def sense(
-        self, indices: Indices, views: Views, space: DepthImage, seeds: NDArray[np.uint64]
+    def render_depth(
+        self, indices: Indices, views: CameraPoses, space: DepthImage, seeds: NDArray[np.uint64]
     ) -> Images:
-        """See `Simulator.sense`.
+        """See `Simulator.render_depth`.
 
         Raises:
             ValueError: a view is not possible, the space has another size than the camera, or a
@@ -141,7 +141,7 @@ class FastSimulator:
 
     def close(self) -> None:
         """See `Simulator.close`."""
-        self._team.close()
+        self._threads.close()
 
     def _take_pictures(
         self,
@@ -165,7 +165,7 @@ class FastSimulator:
             colors.reshape(len(colors), pixels if len(colors) else 0, 3),
             codes.reshape(len(codes), pixels if len(codes) else 0),
         )
-        self._team.share(take, len(indices))
+        self._threads.parallel_for(take, len(indices))
 
     def _checked(self, indices: Indices, loaded: bool = False) -> Indices:
         """The indices as compiled loops take them, which look at no limits themselves."""
@@ -274,8 +274,8 @@ def _room(worlds: WorldArrays, indices: Indices) -> tuple[Floats, Floats]:
     return low, np.where(there, center + reach, -np.inf).max(axis=1)
 
 
-def _view_arrays(views: Views, n: int) -> ViewArrays:
-    """Views as the kernels take them; there must be n, all possible ones."""
+def _view_arrays(views: CameraPoses, n: int) -> ViewArrays:
+    """CameraPoses as the kernels take them; there must be n, all possible ones."""
     _check(views.position_m, (n, 3), "position_m of the views")
     _check(views.rotation, (n, 3, 3), "rotation of the views")
     _check(views.near_m, (n,), "near_m of the views")

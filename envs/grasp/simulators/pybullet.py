@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import Views, focal_length_px, sense_depth
+from envs.grasp.sensors.camera import CameraPoses, focal_length_px, sense_depth
 from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
 from envs.grasp.simulators.bodies import (
@@ -67,7 +67,7 @@ class PyBulletSimulator:
             flags[row] = client.move(slot, path_rad[row])
         return Contacts(touched=flags[:, 0], collided=flags[:, 1])
 
-    def render(self, indices: Indices, views: Views) -> Images:
+    def render(self, indices: Indices, views: CameraPoses) -> Images:
         """See `Simulator.render`."""
         camera, matrices = (
             views.camera,
@@ -81,10 +81,10 @@ class PyBulletSimulator:
             return np.stack([rgb for rgb, _ in images])
         return buffer_to_depth(np.stack([buffer for _, buffer in images]), views)
 
-    def sense(
-        self, indices: Indices, views: Views, space: DepthImage, seeds: NDArray[np.uint64]
+    def render_depth(
+        self, indices: Indices, views: CameraPoses, space: DepthImage, seeds: NDArray[np.uint64]
     ) -> Images:
-        """See `Simulator.sense`."""
+        """See `Simulator.render_depth`."""
         return sense_depth(self.render(indices, views), space, views.noise_sigma_m, seeds)
 
     def close(self) -> None:
@@ -204,7 +204,7 @@ class _Client:
         return [point[3] for point in points]
 
 
-def view_matrices(views: Views) -> list[list[float]]:
+def view_matrices(views: CameraPoses) -> list[list[float]]:
     """OpenGL's view matrices of n views, each column by column."""
     # OpenGL's camera axes are x right, y up, z backward.
     axes = np.swapaxes(views.rotation, 1, 2) * np.array([[1.0], [-1.0], [-1.0]])
@@ -214,7 +214,7 @@ def view_matrices(views: Views) -> list[list[float]]:
     return _columns(matrices)
 
 
-def projection_matrices(views: Views) -> list[list[float]]:
+def projection_matrices(views: CameraPoses) -> list[list[float]]:
     """OpenGL's projection matrices of n views, each column by column.
 
     TinyRenderer samples pixel (c, r) at the image point (c, r + 1), not at the pixel's centre; the
@@ -238,7 +238,7 @@ def _columns(matrices: Floats) -> list[list[float]]:
     return columns
 
 
-def buffer_to_depth(buffer: Images, views: Views) -> Images:
+def buffer_to_depth(buffer: Images, views: CameraPoses) -> Images:
     """Metres (n, H, W) from OpenGL's depth buffers in [0, 1]; infinite where nothing was drawn."""
     near = views.near_m.astype(np.float32)[:, None, None]
     far = views.far_m.astype(np.float32)[:, None, None]

@@ -11,7 +11,7 @@ PARTS_PER_THREAD = 2
 MIN_ROWS_PER_PART = 8
 
 
-class Team:
+class ThreadPool:
     """The calling thread and its helpers. Who is free takes the next part of the rows.
 
     So the caller never waits for a helper that has not got a processor, as it would with the
@@ -30,7 +30,7 @@ class Team:
         self._threads = threads = threads or len(os.sched_getaffinity(0))
         self._helpers = ThreadPoolExecutor(threads - 1) if threads > 1 else None
 
-    def share(self, work: Callable[[int, int], None], rows: int) -> None:
+    def parallel_for(self, work: Callable[[int, int], None], rows: int) -> None:
         """Calls `work` with the first and the end of parts that make up all the rows.
 
         Args:

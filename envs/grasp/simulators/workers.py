@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import Views
+from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Support
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices, SimulatorError
 from envs.grasp.simulators.pybullet import PyBulletSimulator
@@ -53,15 +53,15 @@ class ParallelSimulator:
             np.concatenate([part.collided for part in parts]),
         )
 
-    def render(self, indices: Indices, views: Views) -> Images:
+    def render(self, indices: Indices, views: CameraPoses) -> Images:
         """See `Simulator.render`."""
         return np.concatenate(self._call("render", indices, views))
 
-    def sense(
-        self, indices: Indices, views: Views, space: DepthImage, seeds: NDArray[np.uint64]
+    def render_depth(
+        self, indices: Indices, views: CameraPoses, space: DepthImage, seeds: NDArray[np.uint64]
     ) -> Images:
-        """See `Simulator.sense`."""
-        return np.concatenate(self._call("sense", indices, views, space, seeds))
+        """See `Simulator.render_depth`."""
+        return np.concatenate(self._call("render_depth", indices, views, space, seeds))
 
     def close(self) -> None:
         """See `Simulator.close`."""

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
-from rewards.grasp.transition import Transition
+from rewards.grasp.transition import GraspTransition
 
 
 class Near:
@@ -18,7 +18,7 @@ class Near:
     def __init__(self, settings: Settings) -> None:
         self.scale_m = settings.scale_m
 
-    def __call__(self, transition: Transition) -> NDArray[np.float64]:
+    def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
         """Return the reward of N transitions, shape (N,)."""
         to_target_m = transition.target_point_m - transition.tooltip_m
         return np.exp(-np.linalg.norm(to_target_m, axis=-1) / self.scale_m)

@@ -44,7 +44,7 @@ def test_make_builds_it_by_name() -> None:
         assert isinstance(reward, float)
         assert (terminated, truncated) == (False, step == 2)
         assert reward == pytest.approx(sum(info["reward_terms"].values()))
-        assert info["measures"]["success"] == 0.0
+        assert info["episode_metrics"]["success"] == 0.0
     env.close()
 
 
@@ -73,7 +73,7 @@ def test_one_environment_is_the_batch_of_one(env: GraspEnv) -> None:
         assert reward == rewards[0]
         assert not terminated
         assert not truncated
-        for key in ("reward_terms", "measures"):
+        for key in ("reward_terms", "episode_metrics"):
             assert info[key] == {name: values[0] for name, values in infos[key].items()}
     batch.close()
 
@@ -87,7 +87,7 @@ def test_success_ends_the_episode_and_leaves_the_reset_to_the_user(env: GraspEnv
     assert terminated
     assert not truncated
     assert reward > 1.0  # position, rotation, and some for the approach
-    assert info["measures"]["success"] == 1.0
+    assert info["episode_metrics"]["success"] == 1.0
     np.testing.assert_array_equal(observations["depth"], first["depth"])
     np.testing.assert_array_equal(env._batch.scenes.target_m, scenes.target_m)
     second, _ = env.reset()

@@ -131,7 +131,7 @@ def test_spaces_contain_what_is_delivered(make: MakeEnv, frame_grab: bool) -> No
         assert reward.dtype == np.float64
         assert terminated.dtype == truncated.dtype == bool
         assert infos["same_frame"].shape == (5,)
-        for values in (*infos["measures"].values(), *infos["reward_terms"].values()):
+        for values in (*infos["episode_metrics"].values(), *infos["reward_terms"].values()):
             assert values.shape == (5,)
 
 
@@ -158,7 +158,7 @@ def test_autoreset_happens_in_the_step_an_episode_ends_in(make: MakeEnv, frame_g
     np.testing.assert_array_equal(infos["_final_obs"], done)
     final = infos["final_obs"]
     assert final.keys() == observations.keys()
-    # Episodes that go on keep their scenes, the others have new ones.
+    # RunningEpisodes that go on keep their scenes, the others have new ones.
     moved = (env.scenes.target_m != scenes.target_m).any(axis=1)
     np.testing.assert_array_equal(moved, done)
     # The privileged numbers tell before from after: progress is zero at a beginning.
@@ -233,11 +233,11 @@ def test_the_perfect_action_succeeds_everywhere_at_once_without_collision(make: 
         assert terminated.all()
         assert not truncated.any()
         np.testing.assert_allclose(reward, 1.0)  # position and rotation
-        measures = infos["measures"]
-        assert measures["success"].all()
-        assert not measures["collision"].any()
-        assert measures["position_error_m"].max() < 1e-9
-        assert measures["yaw_error_deg"].max() < 1e-9
+        episode_metrics = infos["episode_metrics"]
+        assert episode_metrics["success"].all()
+        assert not episode_metrics["collision"].any()
+        assert episode_metrics["position_error_m"].max() < 1e-9
+        assert episode_metrics["yaw_error_deg"].max() < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -263,14 +263,14 @@ def test_success_is_judged_by_the_goal_region(
     assert (infos["reward_terms"]["position"] == (0.5 if position else 0.0)).all()
     assert (infos["reward_terms"]["rotation"] == (0.5 if rotation else 0.0)).all()
     assert (terminated == rotation).all()
-    assert (infos["measures"]["success"] == rotation).all()
-    measures = infos["measures"]
+    assert (infos["episode_metrics"]["success"] == rotation).all()
+    episode_metrics = infos["episode_metrics"]
     up, gap = abs(change.get("up_m", 0.0)), abs(change.get("gap_m", 0.0))
-    np.testing.assert_allclose(measures["position_error_y_m"], up, atol=1e-9)
-    np.testing.assert_allclose(measures["position_error_z_m"], gap, atol=1e-9)
-    np.testing.assert_allclose(measures["position_error_m"], max(up, gap), atol=1e-9)
+    np.testing.assert_allclose(episode_metrics["position_error_y_m"], up, atol=1e-9)
+    np.testing.assert_allclose(episode_metrics["position_error_z_m"], gap, atol=1e-9)
+    np.testing.assert_allclose(episode_metrics["position_error_m"], max(up, gap), atol=1e-9)
     turn = np.degrees(abs(change.get("turn_rad", 0.0)))
-    np.testing.assert_allclose(measures["yaw_error_deg"], turn, atol=1e-6)
+    np.testing.assert_allclose(episode_metrics["yaw_error_deg"], turn, atol=1e-6)
 
 
 def test_touching_is_paid_once_and_position_is_not_paid_inside_the_block(make: MakeEnv) -> None:
@@ -289,15 +289,15 @@ def test_collision_is_paid_per_step_and_reported_for_the_episode(make: MakeEnv) 
     env.reset(seed=0)
     table = np.tile([0.0, 0.0, -1.0, 0.0], (2, 1))  # the cup's lower half in the table
     _, _, _, _, infos = env.step(still(env))
-    assert not infos["measures"]["collision"].any()
+    assert not infos["episode_metrics"]["collision"].any()
     for _ in range(2):
         _, _, _, _, infos = env.step(table)
         np.testing.assert_allclose(infos["reward_terms"]["collision"], -0.1)
-        assert infos["measures"]["collision"].all()
+        assert infos["episode_metrics"]["collision"].all()
     env.step(still(env))  # out of it
     _, _, _, _, infos = env.step(still(env))
     np.testing.assert_allclose(infos["reward_terms"]["collision"], 0.0)
-    assert infos["measures"]["collision"].all()
+    assert infos["episode_metrics"]["collision"].all()
 
 
 @pytest.mark.parametrize("episode_steps", [1, 4])
@@ -441,7 +441,7 @@ def test_parameters_hold_from_the_next_reset_on(make: MakeEnv) -> None:
     _, _, terminated, _, infos = env.step(perfect(env, **far))
     np.testing.assert_array_equal(terminated, mask)
     # Errors are reported against the last lesson's region all the same.
-    np.testing.assert_allclose(infos["measures"]["position_error_y_m"], 0.02)
+    np.testing.assert_allclose(infos["episode_metrics"]["position_error_y_m"], 0.02)
 
 
 def test_parameters_replace_those_set_before(make: MakeEnv) -> None:

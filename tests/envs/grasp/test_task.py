@@ -15,9 +15,9 @@ from envs.grasp.settings import Goal, Workspace
 from envs.grasp.simulators.base import Contacts
 from envs.grasp.task import (
     Arm,
+    EpisodeProgress,
     GoalRegion,
     Motion,
-    Progress,
     Tools,
     advance,
     block_offset,
@@ -182,7 +182,7 @@ def test_judge_and_advance(box_scene: Callable[..., Scenes]) -> None:
     before = tools(np.tile([0.9, 0.0, 0.7], (5, 1)), np.zeros(5))
     contacts = Contacts(np.array([0, 0, 1, 0, 0], bool), np.array([0, 1, 0, 0, 0], bool))
     motion = Motion(before, tools(tooltip, yaw), np.arange(5.0), contacts)
-    begun = Progress.start(5)
+    begun = EpisodeProgress.start(5)
     transition = judge(motion, scenes, GoalRegion.like(Goal(), 5), begun)
     assert transition.position_right.tolist() == [True, True, True, False, False]
     assert transition.rotation_right.tolist() == [True, True, False, False, False]
@@ -223,7 +223,7 @@ def test_a_lax_yaw_limit_is_obeyed_for_each(box_scene: Callable[..., Scenes]) ->
     nothing = Contacts(np.zeros(2, bool), np.zeros(2, bool))
     turned = tools(tooltip, np.full(2, 0.2 + np.radians(8.0)))
     transition = judge(
-        Motion(turned, turned, np.ones(2), nothing), scenes, region, Progress.start(2)
+        Motion(turned, turned, np.ones(2), nothing), scenes, region, EpisodeProgress.start(2)
     )
     assert transition.position_right.all()
     assert transition.rotation_right.tolist() == [True, False]

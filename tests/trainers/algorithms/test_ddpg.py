@@ -17,7 +17,7 @@ from torch import Tensor
 
 from trainers.algorithms.ddpg import DDPG, DDPGHyperparameters, DDPGSettings
 from trainers.common.errors import UserError
-from trainers.experience.env_runner import Interaction, NonFiniteError, concatenate
+from trainers.experience.env_runner import EnvRunner, NonFiniteError, concatenate
 from trainers.networks.deterministic import DeterministicPolicy, DeterministicSettings
 from trainers.networks.network import NetworkFactory
 from trainers.networks.observations import Observations, to_tensors
@@ -88,15 +88,15 @@ def on_a_line(
         truncated=second * [0, 1],
         final={"x": np.full((4, 2, 1), 50.0)},
     )
-    interaction = Interaction(env)
-    interaction.reset()
+    env_runner = EnvRunner(env)
+    env_runner.reset()
     hyper = {"batch_size": 1, "buffer_size": 8, "buffer_init_steps": 8, **hyperparameters}
     settings = DDPGSettings(
         time_horizon=4, hyperparameters=hyper, network_settings={"hidden_units": 4}
     )
     generator = torch.Generator().manual_seed(0)
     factory = make_factory(LINE.spaces)
-    return DDPG(factory, settings, interaction, generator, torch.device("cpu"))
+    return DDPG(factory, settings, env_runner, generator, torch.device("cpu"))
 
 
 def targets_of(algorithm: DDPG, monkeypatch: pytest.MonkeyPatch) -> list[list[float]]:
@@ -108,8 +108,8 @@ def targets_of(algorithm: DDPG, monkeypatch: pytest.MonkeyPatch) -> list[list[fl
     )
     algorithm.collect()
     algorithm.update(0.0)
-    places = np.arange(8)  # time by time, as long as the ring has not come round
-    found: list[list[float]] = algorithm._targets(places).reshape(4, 2).tolist()
+    indices = np.arange(8)  # time by time, as long as the ring has not come round
+    found: list[list[float]] = algorithm._targets(indices).reshape(4, 2).tolist()
     return found
 
 
@@ -171,7 +171,7 @@ def test_targets_begin_alike_and_follow_by_tau(make_factory: Callable[..., Netwo
             mine.fill_(8.0)
             theirs.fill_(0.0)
     for expected in (2.0, 3.5, 4.625):
-        policy.follow()
+        policy.update_targets()
         assert all((parameter == expected).all() for parameter in target)
     assert all((parameter == 8.0).all() for parameter in online)
 
@@ -287,9 +287,9 @@ def test_updates_come_as_often_as_asked_for(
     for name in calls:
         method = getattr(algorithm, name)
 
-        def counted(places: Any, name: str = name, method: Any = method) -> Any:
+        def counted(indices: Any, name: str = name, method: Any = method) -> Any:
             calls[name] += 1
-            return method(places)
+            return method(indices)
 
         monkeypatch.setattr(algorithm, name, counted)
     followed: list[tuple[int, int]] = []
@@ -417,7 +417,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_before_the_weights_change(
     make_ddpg: MakeDDPG,
 ) -> None:
     algorithm = make_ddpg()
-    env = algorithm._interaction.env
+    env = algorithm._env_runner.env
     step = env.step
 
     def huge(actions: np.ndarray) -> Any:
@@ -450,7 +450,7 @@ def test_a_frame_is_encoded_once_as_long_as_it_is_in_view(
     ended = [int(moment.step.done.sum()) for moment in moments[:-1]]
     assert sum(ended) > 0
     assert encoded == [len(moments[0].actions), *filter(None, ended)]
-    space = algorithm._interaction.env.single_observation_space
+    space = algorithm._env_runner.env.single_observation_space
     for moment in moments:
         seen = to_tensors(moment.observations, space, torch.device("cpu"))
         torch.testing.assert_close(torch.from_numpy(moment.actions), online.act(seen))
@@ -481,11 +481,11 @@ def test_going_back_to_a_state_repeats_everything(make_ddpg: MakeDDPG) -> None:
         one_round(algorithm)
     weights = {name: t.clone() for name, t in algorithm.policy.state_dict().items()}
     state = copy.deepcopy(algorithm.state_dict())
-    world = copy.deepcopy(algorithm._interaction.state_dict())
+    world = copy.deepcopy(algorithm._env_runner.state_dict())
     one_round(algorithm)
     after = snapshot(algorithm.policy.parameters())
     algorithm.load_state_dict(weights, state)
-    algorithm._interaction.load_state_dict(world)
+    algorithm._env_runner.load_state_dict(world)
     assert changed(after, algorithm.policy.parameters())
     one_round(algorithm)
     assert not changed(after, algorithm.policy.parameters())
@@ -501,7 +501,7 @@ def test_a_run_resumed_without_its_buffer_fills_it_with_its_policy_first(
     assert algorithm.state_dict()["replay_buffer"] is None
     other = make_ddpg("target", hyper, seed=1)
     other.load_state_dict(dict(algorithm.policy.state_dict()), algorithm.state_dict())
-    other._interaction.load_state_dict(copy.deepcopy(algorithm._interaction.state_dict()))
+    other._env_runner.load_state_dict(copy.deepcopy(algorithm._env_runner.state_dict()))
     before = snapshot(other.policy.online.parameters())
     one_round(other)
     assert not changed(before, other.policy.online.parameters())
@@ -520,7 +520,7 @@ def learned(algorithm: DDPG, rounds: int) -> tuple[float, float]:
     for number in range(rounds):
         algorithm.collect()
         algorithm.update(number / rounds)
-        parts.append(algorithm._interaction.take_finished())
+        parts.append(algorithm._env_runner.pop_finished())
     first, last = concatenate(parts[:5]), concatenate(parts[-5:])
     return float((first.rewards / first.lengths).mean()), float(
         (last.rewards / last.lengths).mean()

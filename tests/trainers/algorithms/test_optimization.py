@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from trainers.algorithms.optimization import descend
+from trainers.algorithms.optimization import optimizer_step
 from trainers.experience.env_runner import NonFiniteError
 
 INFINITE = float("inf")
@@ -15,7 +15,7 @@ INFINITE = float("inf")
 def stepped(slope: float, most: float) -> float:
     """How far a step of plain descent with rate 1 moves a weight whose loss has this slope."""
     weight = nn.Parameter(torch.zeros(()))
-    descend(torch.optim.SGD([weight], lr=1.0), slope * weight, [weight], most, 7)
+    optimizer_step(torch.optim.SGD([weight], lr=1.0), slope * weight, [weight], most, 7)
     return weight.item()
 
 
@@ -26,7 +26,7 @@ def test_a_step_goes_down_the_gradient_and_no_further_than_its_norm_may_be() -> 
 
 def test_other_parameters_get_no_gradient() -> None:
     own, other = nn.Parameter(torch.ones(())), nn.Parameter(torch.ones(()))
-    descend(torch.optim.SGD([own], lr=1.0), own * other, [own], INFINITE, 7)
+    optimizer_step(torch.optim.SGD([own], lr=1.0), own * other, [own], INFINITE, 7)
     assert (own.item(), other.item()) == (0.0, 1.0)
     assert other.grad is None
 
@@ -36,7 +36,7 @@ def test_what_is_not_finite_changes_nothing(scale: float) -> None:
     """The last one's loss is finite, its gradient's norm is not."""
     weight = nn.Parameter(torch.full((), 1e-25))
     with pytest.raises(NonFiniteError, match=r"^step 7: the loss is .*, its gradient's norm"):
-        descend(torch.optim.SGD([weight], lr=1.0), weight * scale * 1e9, [weight], 1.0, 7)
+        optimizer_step(torch.optim.SGD([weight], lr=1.0), weight * scale * 1e9, [weight], 1.0, 7)
     assert weight.item() == pytest.approx(1e-25)
 
 
@@ -44,6 +44,6 @@ def test_what_the_loss_does_not_know_stays_as_it_is() -> None:
     known, unknown = nn.Parameter(torch.ones(())), nn.Parameter(torch.ones(()))
     optimizer = torch.optim.Adam([known, unknown], lr=0.1)
     for _ in range(2):  # the second time, too, when it could have a gradient of the first
-        descend(optimizer, 2.0 * known, [known, unknown], INFINITE, 7)
+        optimizer_step(optimizer, 2.0 * known, [known, unknown], INFINITE, 7)
     assert known.item() == pytest.approx(0.8)
     assert (unknown.item(), unknown.grad) == (1.0, None)

@@ -25,7 +25,7 @@ from trainers.algorithms.ppo import (
     clipped_value_loss,
     surrogate_loss,
 )
-from trainers.experience.env_runner import Interaction, NonFiniteError, concatenate
+from trainers.experience.env_runner import EnvRunner, NonFiniteError, concatenate
 from trainers.networks.distributions import Categorical, DiagonalGaussian
 from trainers.networks.network import NetworkFactory
 from trainers.session import Session
@@ -361,8 +361,8 @@ def test_a_batch_in_which_all_is_equal_changes_the_critic_alone(
         terminated=np.ones((8, 2)),
         final={"x": ones[1:]},
     )
-    interaction = Interaction(env)
-    interaction.reset()
+    env_runner = EnvRunner(env)
+    env_runner.reset()
     settings = PPOSettings(
         hyperparameters=PPOHyperparameters(
             batch_size=4, buffer_size=16, beta=0.0, learning_rate=0.1
@@ -371,7 +371,7 @@ def test_a_batch_in_which_all_is_equal_changes_the_critic_alone(
     )
     generator = torch.Generator().manual_seed(0)
     factory = make_factory(space.spaces)
-    algorithm = PPO(factory, settings, interaction, generator, torch.device("cpu"))
+    algorithm = PPO(factory, settings, env_runner, generator, torch.device("cpu"))
     actor = snapshot(algorithm.policy.actor_parameters())
     critic = snapshot(algorithm.policy.critic_parameters())
     statistics, _ = one_round(algorithm)
@@ -385,7 +385,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_before_the_weights_change(
     make_session: Callable[..., Session],
 ) -> None:
     session = make_session()
-    algorithm, env = session.algorithm, session.interaction.env
+    algorithm, env = session.algorithm, session.env_runner.env
     step = env.step
 
     def huge(actions: np.ndarray) -> Any:
@@ -407,12 +407,12 @@ def test_going_back_to_a_state_repeats_everything(make_ppo: MakePPO) -> None:
     one_round(algorithm)
     weights = {name: t.clone() for name, t in algorithm.policy.state_dict().items()}
     state = copy.deepcopy(algorithm.state_dict())
-    interaction = algorithm._interaction
-    world = copy.deepcopy(interaction.state_dict())
+    env_runner = algorithm._env_runner
+    world = copy.deepcopy(env_runner.state_dict())
     one_round(algorithm)
     after = snapshot(algorithm.policy.parameters())
     algorithm.load_state_dict(weights, state)
-    interaction.load_state_dict(world)
+    env_runner.load_state_dict(world)
     assert changed(after, algorithm.policy.parameters())
     one_round(algorithm)
     assert not changed(after, algorithm.policy.parameters())
@@ -427,7 +427,7 @@ def learned(algorithm: PPO, rounds: int) -> tuple[float, float]:
     for number in range(rounds):
         algorithm.collect()
         algorithm.update(number / rounds)
-        parts.append(algorithm._interaction.take_finished())
+        parts.append(algorithm._env_runner.pop_finished())
     first, last = parts[0], concatenate(parts[-2:])
     return float((first.rewards / first.lengths).mean()), float(
         (last.rewards / last.lengths).mean()

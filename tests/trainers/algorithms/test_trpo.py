@@ -30,7 +30,7 @@ from trainers.algorithms.trpo import (
     line_search,
     surrogate_gain,
 )
-from trainers.experience.env_runner import Interaction, NonFiniteError, concatenate
+from trainers.experience.env_runner import EnvRunner, NonFiniteError, concatenate
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Categorical, DiagonalGaussian, Distribution
 from trainers.networks.network import NetworkFactory
@@ -385,11 +385,11 @@ def test_going_back_to_a_state_repeats_everything(make_trpo: MakeTRPO) -> None:
     one_round(algorithm)
     weights = {name: t.clone() for name, t in algorithm.policy.state_dict().items()}
     state = copy.deepcopy(algorithm.state_dict())
-    world = copy.deepcopy(algorithm._interaction.state_dict())
+    world = copy.deepcopy(algorithm._env_runner.state_dict())
     one_round(algorithm)
     after = snapshot(iter(algorithm.policy.state_dict().values()))
     algorithm.load_state_dict(weights, state)
-    algorithm._interaction.load_state_dict(world)
+    algorithm._env_runner.load_state_dict(world)
     assert changed(after, iter(algorithm.policy.state_dict().values()))
     one_round(algorithm)
     assert not changed(after, iter(algorithm.policy.state_dict().values()))
@@ -418,14 +418,14 @@ def test_a_batch_in_which_all_is_equal_changes_the_critic_alone(
         terminated=np.ones((8, 2)),
         final={"x": ones[1:]},
     )
-    interaction = Interaction(env)
-    interaction.reset()
+    env_runner = EnvRunner(env)
+    env_runner.reset()
     options = TRPOSettings(
         hyperparameters={"batch_size": 4, "buffer_size": 16}, network_settings={"hidden_units": 4}
     )
     generator = torch.Generator().manual_seed(0)
     factory = make_factory(space.spaces)
-    algorithm = TRPO(factory, options, interaction, generator, torch.device("cpu"))
+    algorithm = TRPO(factory, options, env_runner, generator, torch.device("cpu"))
     actor = snapshot(algorithm.policy.actor_parameters())
     critic = snapshot(algorithm.policy.critic_parameters())
     statistics = one_round(algorithm)
@@ -486,7 +486,7 @@ def test_schedules_reach_the_critic_and_the_trust_region(make_trpo: MakeTRPO) ->
 def test_gradient_descent_moves_the_critic_alone(make_trpo: MakeTRPO) -> None:
     algorithm = make_trpo("target", {"num_epoch": 3})
     algorithm.collect()
-    rollout = algorithm._take_rollout()
+    rollout = algorithm._pop_rollout()
     actor = snapshot(algorithm.policy.actor_parameters())
     critic = snapshot(algorithm.policy.critic_parameters())
     algorithm._set_schedules(0.0)
@@ -562,7 +562,7 @@ def learned(algorithm: TRPO, rounds: int) -> tuple[float, float]:
     for number in range(rounds):
         algorithm.collect()
         algorithm.update(number / rounds)
-        parts.append(algorithm._interaction.take_finished())
+        parts.append(algorithm._env_runner.pop_finished())
     first, last = parts[0], concatenate(parts[-2:])
     return float((first.rewards / first.lengths).mean()), float(
         (last.rewards / last.lengths).mean()

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from encoders.spaces import DepthImage
 from trainers.experience.collector import OnPolicyCollector
-from trainers.experience.env_runner import Interaction
+from trainers.experience.env_runner import EnvRunner
 from trainers.experience.reward_normalizer import RewardNormalizer
 from trainers.experience.rollout import Rollout
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
@@ -58,10 +58,10 @@ def collector_on(
     encoders = probe if "depth" in space else {}
     bare = PolicySettings(num_layers=0, **settings)
     policy = ActorCritic(make_factory(space, encoders), bare)
-    interaction = Interaction(env)
-    interaction.reset()
+    env_runner = EnvRunner(env)
+    env_runner.reset()
     generator = torch.Generator().manual_seed(0)
-    return OnPolicyCollector(policy, interaction, steps, generator, CPU), policy
+    return OnPolicyCollector(policy, env_runner, steps, generator, CPU), policy
 
 
 def value_is(policy: ActorCritic, slope: float, intercept: float) -> None:
@@ -113,15 +113,15 @@ def test_normalized_rewards_are_for_the_learner_alone(
     torch.manual_seed(0)
     policy = ActorCritic(make_factory(PLAIN.spaces), PolicySettings(num_layers=0))
     value_is(policy, 0.0, 0.0)
-    interaction = Interaction(env)
-    interaction.reset()
+    env_runner = EnvRunner(env)
+    env_runner.reset()
     normalizer = RewardNormalizer(1, gamma=0.0)
     generator = torch.Generator().manual_seed(0)
-    collector = OnPolicyCollector(policy, interaction, 2, generator, CPU, normalizer)
+    collector = OnPolicyCollector(policy, env_runner, 2, generator, CPU, normalizer)
     rollout = collector.collect(gamma=0.0, lambd=0.0)
     assert rollout.returns.tolist() == pytest.approx([1.0, 3.0])  # the deviation of 2 and 6 is 2
-    assert interaction.take_finished().rewards.tolist() == [8.0]
-    other = OnPolicyCollector(policy, interaction, 2, generator, CPU, RewardNormalizer(1, 0.0))
+    assert env_runner.pop_finished().rewards.tolist() == [8.0]
+    other = OnPolicyCollector(policy, env_runner, 2, generator, CPU, RewardNormalizer(1, 0.0))
     other.load_state_dict(collector.state_dict())
     normalizers = [c.state_dict()["reward_normalizer"] for c in (other, collector)]
     assert normalizers[0] == normalizers[1]
@@ -323,7 +323,7 @@ def test_sequences_run_again_from_their_stored_states_say_what_was_kept(
         for size in (4, len(rollout)):
             for rows in rollout.minibatches(size, generator):
                 is_what_the_policy_says(rollout, policy, rows)
-        is_what_the_policy_says(rollout, policy, rollout.in_groups())
+        is_what_the_policy_says(rollout, policy, rollout.in_shuffle_groups())
         forgotten = policy(Observations({}, rollout.vectors))[1]
         assert not torch.allclose(forgotten, rollout.values, atol=1e-3)
 
@@ -379,7 +379,7 @@ def test_with_memory_too_a_frame_is_kept_once(
     (probe,) = policy.actor.frame_encoders.values()
     assert isinstance(probe, Probe)
     probe.shown.clear()
-    is_what_the_policy_says(rollout, policy, rollout.in_groups())
+    is_what_the_policy_says(rollout, policy, rollout.in_shuffle_groups())
     assert len(probe.shown) == len(set(probe.shown)) == 5 + 2 + 3
 
 
@@ -389,5 +389,5 @@ def test_without_memory_there_is_nothing_to_remember(
     collector, policy = collector_on(camera_script(scripted), make_factory, 5)
     rollout = collector.collect(0.9, 0.9)
     assert rollout.states.shape == (15, 0)
-    assert torch.equal(rollout.groups, rollout.frame_index)
+    assert torch.equal(rollout.shuffle_groups, rollout.frame_index)
     assert policy.initial_state(3).shape == (3, 0)

@@ -12,8 +12,8 @@ from gymnasium.spaces import Box
 
 from encoders.spaces import RgbImage
 from trainers.experience.env_runner import (
-    Episodes,
-    Interaction,
+    EnvRunner,
+    EpisodeBatch,
     NonFiniteError,
     StopRequested,
     concatenate,
@@ -34,47 +34,47 @@ def script(scripted: Any, **changes: Any) -> Any:
         "truncated": ENDS,
         "final": {"x": 100 + time[1:], "eye": eye[1:]},
         "terms": {"near": np.multiply(REWARD, 0.25), "far": np.multiply(REWARD, 0.75)},
-        "measures": {"success": ENDS, "error_m": np.multiply(REWARD, 0.1)},
+        "episode_metrics": {"success": ENDS, "error_m": np.multiply(REWARD, 0.1)},
     }
     return scripted(SPACE, **(parts | changes))
 
 
-def begun(env: Any) -> Interaction:
-    interaction = Interaction(env)
-    interaction.reset()
-    return interaction
+def begun(env: Any) -> EnvRunner:
+    env_runner = EnvRunner(env)
+    env_runner.reset()
+    return env_runner
 
 
 def test_episodes_are_added_up_over_resets(scripted: Any) -> None:
-    interaction = begun(script(scripted))
+    env_runner = begun(script(scripted))
     for _ in range(4):
-        interaction.step(ACTIONS)
-    episodes = interaction.take_finished()
+        env_runner.step(ACTIONS)
+    episodes = env_runner.pop_finished()
     # In the order they ended: the first env's steps 1-2, the second's 1-3, then 3-4 and 4.
     assert episodes.rewards.tolist() == [1 + 2, 10 + 20 + 40, 4 + 8, 80]
     assert episodes.lengths.tolist() == [2, 3, 2, 1]
     assert episodes.terms["near"].tolist() == [0.75, 17.5, 3.0, 20.0]
     assert episodes.terms["far"].tolist() == [2.25, 52.5, 9.0, 60.0]
-    assert episodes.measures["error_m"].tolist() == pytest.approx([0.2, 4.0, 0.8, 8.0])
+    assert episodes.episode_metrics["error_m"].tolist() == pytest.approx([0.2, 4.0, 0.8, 8.0])
     assert episodes.successes.tolist() == [True] * 4
     assert len(episodes) == 4
-    assert interaction.step_count == 8
+    assert env_runner.step_count == 8
 
 
 def test_finished_episodes_are_taken_once(scripted: Any) -> None:
-    interaction = begun(script(scripted))
-    assert len(interaction.take_finished()) == 0
+    env_runner = begun(script(scripted))
+    assert len(env_runner.pop_finished()) == 0
     for expected in ([], [3.0], [70.0], [12.0, 80.0], []):
-        interaction.step(ACTIONS)
-        assert interaction.take_finished().rewards.tolist() == expected
+        env_runner.step(ACTIONS)
+        assert env_runner.pop_finished().rewards.tolist() == expected
 
 
 def test_environments_that_report_nothing_have_no_terms_and_no_success(scripted: Any) -> None:
-    interaction = begun(script(scripted, terms=None, measures=None))
+    env_runner = begun(script(scripted, terms=None, episode_metrics=None))
     for _ in range(2):
-        interaction.step(ACTIONS)
-    episodes = interaction.take_finished()
-    assert episodes.terms == episodes.measures == {}
+        env_runner.step(ACTIONS)
+    episodes = env_runner.pop_finished()
+    assert episodes.terms == episodes.episode_metrics == {}
     assert episodes.successes.tolist() == [False]
 
 
@@ -82,35 +82,35 @@ def test_a_step_says_what_the_environment_said(scripted: Any) -> None:
     never, terminated = np.zeros((5, 2)), [[0, 0], [0, 1], *[[0, 0]] * 3]
     same = [[1, 0], [0, 1], *[[1, 1]] * 3]
     env = script(scripted, truncated=never, terminated=terminated, same_frame=same)
-    interaction = begun(env)
-    first = interaction.step(ACTIONS + 0.5)
+    env_runner = begun(env)
+    first = env_runner.step(ACTIONS + 0.5)
     assert env.actions_taken[0].tolist() == [[0.5], [0.5]]
     assert first.final_observations is None
     assert first.same_frame.tolist() == [True, False]
-    assert interaction.observations["x"].flatten().tolist() == [1.0, 1.0]
-    second = interaction.step(ACTIONS)
+    assert env_runner.observations["x"].flatten().tolist() == [1.0, 1.0]
+    second = env_runner.step(ACTIONS)
     assert second.reward.tolist() == [2.0, 20.0]
     assert second.terminated.tolist() == [False, True]
     assert second.truncated.tolist() == [False, False]
     assert second.final_observations is not None
     assert second.final_observations["x"][1].tolist() == [102.0]
-    assert interaction.observations["x"].flatten().tolist() == [2.0, 2.0]
+    assert env_runner.observations["x"].flatten().tolist() == [2.0, 2.0]
 
 
 def test_frames_count_as_new_unless_the_environment_says_otherwise(scripted: Any) -> None:
-    interaction = begun(script(scripted))
-    assert interaction.step(ACTIONS).same_frame.tolist() == [False, False]
+    env_runner = begun(script(scripted))
+    assert env_runner.step(ACTIONS).same_frame.tolist() == [False, False]
 
 
 def test_a_stop_is_honoured_before_anything_is_done(scripted: Any) -> None:
     env = script(scripted)
     wanted = iter([False, True])
-    interaction = Interaction(env, lambda: next(wanted))
-    interaction.reset()
-    interaction.step(ACTIONS)
+    env_runner = EnvRunner(env, lambda: next(wanted))
+    env_runner.reset()
+    env_runner.step(ACTIONS)
     with pytest.raises(StopRequested):
-        interaction.step(ACTIONS)
-    assert interaction.step_count == 2
+        env_runner.step(ACTIONS)
+    assert env_runner.step_count == 2
     assert env.time == 1
 
 
@@ -122,30 +122,30 @@ def poisoned(values: Any, at: tuple[int, ...], by: float) -> np.ndarray:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_broken_reward_is_named_with_its_step_and_environment(scripted: Any, bad: float) -> None:
-    interaction = begun(script(scripted, reward=poisoned(REWARD, (1, 1), bad)))
-    interaction.step(ACTIONS)
+    env_runner = begun(script(scripted, reward=poisoned(REWARD, (1, 1), bad)))
+    env_runner.step(ACTIONS)
     with pytest.raises(NonFiniteError, match=rf"^step 4: the reward of environment 1 is {bad}$"):
-        interaction.step(ACTIONS)
+        env_runner.step(ACTIONS)
 
 
 def test_a_broken_term_is_named_rather_than_the_sum(scripted: Any) -> None:
     terms = {"near": poisoned(REWARD, (0, 0), np.nan), "far": REWARD}
     reward = poisoned(REWARD, (0, 0), np.nan)
-    interaction = begun(script(scripted, reward=reward, terms=terms))
+    env_runner = begun(script(scripted, reward=reward, terms=terms))
     with pytest.raises(
         NonFiniteError, match=r"^step 2: the reward 'near' of environment 0 is nan$"
     ):
-        interaction.step(ACTIONS)
+        env_runner.step(ACTIONS)
 
 
 def test_a_broken_observation_is_named_at_a_step_and_at_the_reset(scripted: Any) -> None:
     eye = np.zeros((6, 2, 2, 2, 3))
     x = poisoned(np.zeros((6, 2, 1)), (1, 1, 0), np.inf)
-    interaction = begun(script(scripted, observations={"x": x, "eye": eye}))
+    env_runner = begun(script(scripted, observations={"x": x, "eye": eye}))
     with pytest.raises(
         NonFiniteError, match=r"^step 2: the observation 'x' of environment 1 is inf"
     ):
-        interaction.step(ACTIONS)
+        env_runner.step(ACTIONS)
     x = poisoned(np.zeros((6, 2, 1)), (0, 0, 0), np.nan)
     with pytest.raises(
         NonFiniteError, match=r"^step 0: the observation 'x' of environment 0 is nan"
@@ -156,57 +156,57 @@ def test_a_broken_observation_is_named_at_a_step_and_at_the_reset(scripted: Any)
 def test_a_broken_last_observation_is_named_where_an_episode_ended(scripted: Any) -> None:
     eye = np.zeros((5, 2, 2, 2, 3))
     x = poisoned(np.full((5, 2, 1), np.nan), (1, 0, 0), 7.0)  # elsewhere it means nothing
-    interaction = begun(script(scripted, final={"x": x, "eye": eye}))
-    interaction.step(ACTIONS)
-    interaction.step(ACTIONS)
+    env_runner = begun(script(scripted, final={"x": x, "eye": eye}))
+    env_runner.step(ACTIONS)
+    env_runner.step(ACTIONS)
     with pytest.raises(
         NonFiniteError, match=r"^step 6: the observation 'x' of environment 1 is nan"
     ):
-        interaction.step(ACTIONS)
+        env_runner.step(ACTIONS)
 
 
 def test_going_back_to_a_state_of_other_environments_is_refused(scripted: Any) -> None:
-    interaction = begun(script(scripted))
-    state = interaction.state_dict()
+    env_runner = begun(script(scripted))
+    state = env_runner.state_dict()
     state["reward"] = np.zeros(3)
     with pytest.raises(ValueError, match=r"^it was saved with 3 environments, not 2$"):
-        interaction.load_state_dict(state)
+        env_runner.load_state_dict(state)
 
 
 def test_going_back_to_a_state_goes_on_with_the_same_books(scripted: Any) -> None:
     env = script(scripted)
-    interaction = begun(env)
-    interaction.step(ACTIONS)
-    state = interaction.state_dict()
+    env_runner = begun(env)
+    env_runner.step(ACTIONS)
+    state = env_runner.state_dict()
     kept = copy.deepcopy(state)
-    interaction.step(ACTIONS)
-    interaction.step(ACTIONS)
+    env_runner.step(ACTIONS)
+    env_runner.step(ACTIONS)
     np.testing.assert_equal(state, kept)  # playing on changes nothing of what was handed out
-    other = Interaction(script(scripted))
+    other = EnvRunner(script(scripted))
     other.load_state_dict(state)
     assert other.step_count == 2
     assert other.observations["x"].flatten().tolist() == [1.0, 1.0]
     other.step(ACTIONS)
     other.step(ACTIONS)
-    episodes = other.take_finished()
+    episodes = other.pop_finished()
     assert episodes.rewards.tolist() == [3, 70]
     assert episodes.lengths.tolist() == [2, 3]
     assert episodes.terms["near"].tolist() == [0.75, 17.5]
     np.testing.assert_equal(state, kept)
 
 
-def some_episodes(*rewards: float) -> Episodes:
+def some_episodes(*rewards: float) -> EpisodeBatch:
     values = np.array(rewards)
-    return Episodes(values, values + 1, {"near": values + 2}, {"success": values > 1})
+    return EpisodeBatch(values, values + 1, {"near": values + 2}, {"success": values > 1})
 
 
 def test_episodes_are_joined_and_chosen() -> None:
-    empty = Episodes(np.zeros(0), np.zeros(0), {}, {})
+    empty = EpisodeBatch(np.zeros(0), np.zeros(0), {}, {})
     joined = concatenate([empty, some_episodes(1.0, 2.0), empty, some_episodes(3.0)])
     assert joined.rewards.tolist() == [1.0, 2.0, 3.0]
     assert joined.terms["near"].tolist() == [3.0, 4.0, 5.0]
     assert joined.successes.tolist() == [False, True, True]
     chosen = joined[np.array([True, False, True])]
     assert chosen.lengths.tolist() == [2.0, 4.0]
-    assert chosen.measures["success"].tolist() == [False, True]
+    assert chosen.episode_metrics["success"].tolist() == [False, True]
     assert len(concatenate([])) == len(concatenate([empty])) == 0

@@ -148,13 +148,13 @@ def check(buffer: ReplayBuffer, world: World, gamma: float, steps: int) -> None:
         for number, one in enumerate(history)
     }
     assert len(buffer) == len(expected)
-    places = places_of(buffer)
-    actions = buffer.actions(places)[:, 0].tolist()
+    indices = places_of(buffer)
+    actions = buffer.actions(indices)[:, 0].tolist()
     assert sorted(actions) == sorted(expected)
-    before = as_seen(buffer.observations(places, NAMES))
-    after = as_seen(buffer.next_observations(places, NAMES))
-    rewards = buffer.rewards(places).tolist()
-    totals, discounts, last = buffer.returns(places, gamma, steps)
+    before = as_seen(buffer.observations(indices, NAMES))
+    after = as_seen(buffer.next_observations(indices, NAMES))
+    rewards = buffer.rewards(indices).tolist()
+    totals, discounts, last = buffer.returns(indices, gamma, steps)
     assert totals.dtype == discounts.dtype == torch.float32
     led_to = as_seen(buffer.next_observations(last, NAMES))
     for i, action in enumerate(actions):

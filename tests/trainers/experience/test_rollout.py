@@ -22,7 +22,7 @@ CPU = torch.device("cpu")
 def rollout_of(
     frame_index: torch.Tensor,
     frames: torch.Tensor | None = None,
-    groups: torch.Tensor | None = None,
+    shuffle_groups: torch.Tensor | None = None,
 ) -> Rollout:
     """A rollout whose only content is its frames; all else of a transition is its number."""
     numbers = torch.arange(len(frame_index), dtype=torch.float32)
@@ -30,7 +30,7 @@ def rollout_of(
         frames={} if frames is None else {"depth": frames},
         frame_index=frame_index,
         vectors={"number": numbers[:, None]},
-        groups=frame_index if groups is None else groups,
+        shuffle_groups=frame_index if shuffle_groups is None else shuffle_groups,
         states=numbers[:, None],
         actions=numbers,
         log_probs=numbers,
@@ -123,8 +123,8 @@ SEQUENCES = torch.tensor([0, 1, 2, 0, 1, 2, 3, 1, 2, 3, 4, 2, 3, 4, 2])
 
 
 def test_sequences_come_in_the_order_of_time_with_what_was_remembered_before_them() -> None:
-    rollout = rollout_of(torch.arange(15), groups=SEQUENCES)
-    rows = rollout.in_groups()
+    rollout = rollout_of(torch.arange(15), shuffle_groups=SEQUENCES)
+    rows = rollout.in_shuffle_groups()
     assert rows.tolist() == [0, 3, 1, 4, 7, 2, 5, 8, 11, 14, 6, 9, 12, 10, 13]
     sequences = rollout.observations(rows).sequences
     assert sequences is not None
@@ -134,7 +134,7 @@ def test_sequences_come_in_the_order_of_time_with_what_was_remembered_before_the
 
 @given(st.integers(1, 20), st.integers(0, 2**31))
 def test_a_sequence_is_cut_at_most_where_a_minibatch_ends(size: int, seed: int) -> None:
-    rollout = rollout_of(torch.arange(15), groups=SEQUENCES)
+    rollout = rollout_of(torch.arange(15), shuffle_groups=SEQUENCES)
     batches = list(rollout.minibatches(size, torch.Generator().manual_seed(seed)))
     pieces = []
     for rows in batches:
@@ -152,8 +152,10 @@ def test_a_sequence_is_cut_at_most_where_a_minibatch_ends(size: int, seed: int) 
 
 def test_a_frame_is_taken_once_wherever_its_sequences_are() -> None:
     frame_index = torch.tensor([0, 1, 0, 1, 0, 2])
-    groups = torch.tensor([0, 1, 0, 1, 2, 3])  # the first environment's episode is cut in two
-    rollout = rollout_of(frame_index, uint16_frames(1, 2, 3), groups)
+    shuffle_groups = torch.tensor(
+        [0, 1, 0, 1, 2, 3]
+    )  # the first environment's episode is cut in two
+    rollout = rollout_of(frame_index, uint16_frames(1, 2, 3), shuffle_groups)
     observations = rollout.observations(torch.tensor([4, 1, 3, 0, 2]))
     assert observations.frame_index is not None
     assert len(observations.frames["depth"]) == 2

@@ -211,7 +211,7 @@ def learned(algorithm: Any, rounds: int) -> float:
     for number in range(rounds):
         algorithm.collect()
         algorithm.update(number / rounds)
-        parts.append(algorithm._interaction.take_finished())
+        parts.append(algorithm._env_runner.pop_finished())
     last = concatenate(parts[-2:])
     assert len(last) == 128
     return float((last.rewards / last.lengths).mean())

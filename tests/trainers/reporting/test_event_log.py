@@ -182,7 +182,7 @@ def test_averager_weighs_by_count_and_starts_anew() -> None:
     averager.add({"reward": 2.0, "length": 10.0})
     averager.add({"reward": 5.0}, count=3)
     averager.add({"reward": float("nan")}, count=0)
-    assert averager.take() == {"reward": 17 / 4, "length": 10.0}
-    assert averager.take() == {}
+    assert averager.pop_means() == {"reward": 17 / 4, "length": 10.0}
+    assert averager.pop_means() == {}
     averager.add({"reward": 1.0})
-    assert averager.take() == {"reward": 1.0}
+    assert averager.pop_means() == {"reward": 1.0}

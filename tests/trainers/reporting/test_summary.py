@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trainers.experience.env_runner import Episodes
+from trainers.experience.env_runner import EpisodeBatch
 from trainers.reporting.summary import Summary, measure_tag
-from trainers.reporting.terminal import ProgressLine
+from trainers.reporting.terminal import RunStatus
 from trainers.session import Session
 
 MakeSession = Callable[..., Session]
@@ -37,9 +37,9 @@ class Log:
 
 class Display:
     def __init__(self) -> None:
-        self.lines: list[ProgressLine] = []
+        self.lines: list[RunStatus] = []
 
-    def update(self, line: ProgressLine) -> None:
+    def update(self, line: RunStatus) -> None:
         self.lines.append(line)
 
 
@@ -49,15 +49,15 @@ def summary_of(log: Log, start_step: int = 0, summary_freq: int = 100) -> Summar
 
 def report(summary: Summary, session: Session, step: int) -> Display:
     display = Display()
-    session.interaction.step_count = step
+    session.env_runner.step_count = step
     summary.report(session, display)  # type: ignore[arg-type]
     return display
 
 
-def episodes(rewards: list[float], **measures: list[float]) -> Episodes:
+def episodes(rewards: list[float], **episode_metrics: list[float]) -> EpisodeBatch:
     values = np.array(rewards)
-    arrays = {name: np.array(numbers) for name, numbers in measures.items()}
-    return Episodes(values, 10 * values, {"near": values / 2, "far": values / 4}, arrays)
+    arrays = {name: np.array(numbers) for name, numbers in episode_metrics.items()}
+    return EpisodeBatch(values, 10 * values, {"near": values / 2, "far": values / 4}, arrays)
 
 
 def test_episodes_weigh_alike_however_they_arrive(make_session: MakeSession) -> None:
@@ -135,7 +135,7 @@ def test_the_status_says_where_the_run_stands(make_session: MakeSession) -> None
         "last_checkpoint": None,
     }
     summary.note_checkpoint(Path("/somewhere/step-9"))
-    session.interaction.step_count = 64
+    session.env_runner.step_count = 64
     summary.status(session, "finished")
     assert log.statuses[-1]["state"] == "finished"
     assert log.statuses[-1]["step"] == 64

@@ -6,19 +6,19 @@ import re
 import pytest
 from rich.console import Console
 
-from trainers.reporting.terminal import ProgressLine, format_count, format_duration, make_progress
+from trainers.reporting.terminal import RunStatus, format_count, format_duration, make_display
 
-LINE = ProgressLine(
+LINE = RunStatus(
     step=1_234_567, reward=-12.3456, lesson=3, success=0.614, steps_per_second=2134.0,
     seconds_left=252.0,
 )  # fmt: skip
-LONGEST = ProgressLine(4_999_999, -199.9994, 18, 1.0, 23_456.0, 23 * 3600 + 59 * 60)
+LONGEST = RunStatus(4_999_999, -199.9994, 18, 1.0, 23_456.0, 23 * 3600 + 59 * 60)
 
 
-def shown(*lines: ProgressLine, terminal: bool, message: str = "", lessons: int = 19) -> str:
+def shown(*lines: RunStatus, terminal: bool, message: str = "", lessons: int = 19) -> str:
     file = io.StringIO()
     console = Console(file=file, force_terminal=terminal, width=80)
-    with make_progress("grasp-01", 5_000_000, lessons, 1_200_000, console) as progress:
+    with make_display("grasp-01", 5_000_000, lessons, 1_200_000, console) as progress:
         for line in lines:
             progress.update(line)
         if message:
@@ -38,7 +38,7 @@ def test_plain_lines() -> None:
 
 
 def test_a_usual_plain_line_fits_into_80_columns() -> None:
-    line = ProgressLine(1_234_567, 0.512, 3, 0.61, 2134.0, 252.0)
+    line = RunStatus(1_234_567, 0.512, 3, 0.61, 2134.0, 252.0)
     assert len(shown(line, terminal=False).splitlines()[-1]) <= 80
 
 
@@ -74,7 +74,7 @@ def test_terminal_panel_is_redrawn_in_place_and_the_cursor_comes_back() -> None:
 def test_the_cursor_comes_back_after_an_error() -> None:
     file = io.StringIO()
     console = Console(file=file, force_terminal=True, width=80)
-    progress = make_progress("r", 10, 1, 0, console)
+    progress = make_display("r", 10, 1, 0, console)
     with pytest.raises(KeyboardInterrupt), progress:
         raise KeyboardInterrupt
     assert "\x1b[?25h" in file.getvalue()
@@ -88,7 +88,7 @@ def test_messages_come_out_word_for_word(terminal: bool) -> None:
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_unknown_figures_are_question_marks(terminal: bool) -> None:
-    line = ProgressLine(step=10, success=float("nan"), seconds_left=float("inf"))
+    line = RunStatus(step=10, success=float("nan"), seconds_left=float("inf"))
     output = without_escapes(shown(line, terminal=terminal))
     for fact in ("reward ?", "success ?", "? steps/s", "? left"):
         assert fact in output
@@ -102,7 +102,7 @@ def test_no_lesson_is_shown_where_there_is_but_one(terminal: bool) -> None:
 def test_a_run_id_is_no_markup() -> None:
     file = io.StringIO()
     console = Console(file=file, force_terminal=True, width=80)
-    with make_progress("try [bold]1[/nope]", 10, 1, 0, console):
+    with make_display("try [bold]1[/nope]", 10, 1, 0, console):
         pass
     assert "try [bold]1[/nope]" in without_escapes(file.getvalue())
 
@@ -113,7 +113,7 @@ def test_a_dumb_terminal_gets_plain_lines(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_the_bar_never_overshoots() -> None:
-    assert " 100% " in without_escapes(shown(ProgressLine(step=5_100_000), terminal=True))
+    assert " 100% " in without_escapes(shown(RunStatus(step=5_100_000), terminal=True))
 
 
 @pytest.mark.parametrize(

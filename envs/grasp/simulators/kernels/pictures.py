@@ -39,7 +39,7 @@ NEVER_PER_M = np.float32(1e-9)
 
 
 class ViewArrays(NamedTuple):
-    """n cameras of one kind; see `envs.grasp.sensors.camera.Views`."""
+    """n cameras of one kind; see `envs.grasp.sensors.camera.CameraPoses`."""
 
     position: Floats
     rotation: Floats

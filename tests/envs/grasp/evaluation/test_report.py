@@ -38,7 +38,7 @@ def env() -> Iterator[GraspVectorEnv]:
 
 
 def actions(env: GraspVectorEnv, *, ahead: float, up: float, yaw_deg: float) -> np.ndarray:
-    """Aims that far from the grasp points."""
+    """PoseCommands that far from the grasp points."""
     scenes = env.scenes
     tooltip = scenes.target_m + ahead * heading(scenes.target_yaw_rad) + [0.0, 0.0, up]
     return env.action_for(tooltip, scenes.target_yaw_rad + np.radians(yaw_deg))

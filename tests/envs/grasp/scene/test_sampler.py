@@ -6,7 +6,7 @@ import pytest
 
 from envs.grasp.scene.placement import BLOCK_CLEARANCE_M, _apart_on_support, rules
 from envs.grasp.scene.sampler import SceneError, Scenes, SceneSampler, heading, to_world
-from envs.grasp.sensors.camera import Views
+from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Camera, GraspSettings, Randomize, Support, Workspace
 
 COUNT = 500
@@ -22,7 +22,7 @@ TWO_CAMERAS = {
 
 def sample(
     settings: GraspSettings, count: int = COUNT, yaw_limit: float = NO_LIMIT, seed: int = 0
-) -> tuple[Scenes, dict[str, Views]]:
+) -> tuple[Scenes, dict[str, CameraPoses]]:
     rng = np.random.default_rng(seed)
     return SceneSampler(settings).sample(rng, np.full(count, yaw_limit))
 

@@ -5,7 +5,7 @@ import pytest
 
 from encoders.spaces import DepthImage
 from envs.grasp.sensors.camera import (
-    Views,
+    CameraPoses,
     euler_rotations,
     focal_length_px,
     look_at,
@@ -21,7 +21,7 @@ FORWARD = Camera(
 )
 
 
-def fixed(camera: Camera, count: int = 1) -> Views:
+def fixed(camera: Camera, count: int = 1) -> CameraPoses:
     return sample_views(camera, np.random.default_rng(0), count, 0.0, 0.0)
 
 
@@ -132,7 +132,7 @@ def test_sampled_views_stay_in_their_ranges_and_use_them() -> None:
 FLAT = np.full((1, 200, 300), 1.0, np.float32)
 
 
-def sense(
+def render_depth(
     depth: np.ndarray, encoding: str = "uint16", sigma: float = 0.005, seed: int = 1
 ) -> np.ndarray:
     """Metres as they are delivered, from one picture."""
@@ -147,7 +147,7 @@ def sense(
 @pytest.mark.parametrize("encoding", ["uint16", "uint8"])
 def test_noise_is_gaussian_around_the_true_depth(encoding: str) -> None:
     sigma = 0.02  # some steps of the coarse encoding
-    error = sense(FLAT, encoding, sigma) - 1.0
+    error = render_depth(FLAT, encoding, sigma) - 1.0
     step = 0.001 if encoding == "uint16" else 1.6 / 255
     spread = np.sqrt(sigma**2 + step**2 / 12)  # the rounding's own is uniform
     assert abs(error.mean()) < 5 * spread / np.sqrt(FLAT.size)
@@ -157,7 +157,7 @@ def test_noise_is_gaussian_around_the_true_depth(encoding: str) -> None:
 
 
 def test_noise_is_independent_between_pixels() -> None:
-    error = sense(FLAT, sigma=0.02)[0] - 1.0
+    error = render_depth(FLAT, sigma=0.02)[0] - 1.0
     for other in (np.roll(error, 1, 0), np.roll(error, 1, 1)):
         assert abs(np.corrcoef(error.ravel(), other.ravel())[0, 1]) < 0.02
 
@@ -166,14 +166,14 @@ def test_noise_is_independent_between_pixels() -> None:
 def test_no_noise_leaves_only_the_encodings_rounding(encoding: str) -> None:
     depth = np.linspace(0.4, 2.0, 900, dtype=np.float32).reshape(1, 30, 30)
     step = 0.001 if encoding == "uint16" else 1.6 / 255
-    error = sense(depth, encoding, sigma=0.0) - depth
+    error = render_depth(depth, encoding, sigma=0.0) - depth
     assert 0.4 * step < np.abs(error).max() <= 0.501 * step
 
 
 @pytest.mark.parametrize("encoding", ["uint16", "uint8"])
 def test_values_are_clamped_after_the_noise(encoding: str) -> None:
     depth = np.array([[[0.1, 0.4, 2.0, 5.0, np.inf]]], np.float32).repeat(500, axis=1)
-    sensed = sense(depth, encoding, sigma=0.01)[0]
+    sensed = render_depth(depth, encoding, sigma=0.01)[0]
     assert sensed.min() == pytest.approx(0.4)
     assert sensed.max() == pytest.approx(2.0)
     np.testing.assert_allclose(sensed[:, 0], 0.4)
@@ -202,5 +202,5 @@ def test_every_picture_has_its_own_sigma() -> None:
 
 def test_true_depth_is_left_alone() -> None:
     depth = FLAT.copy()
-    sense(depth)
+    render_depth(depth)
     np.testing.assert_array_equal(depth, FLAT)

@@ -18,14 +18,14 @@ from envs.grasp.env import make_vector_env
 from envs.grasp.robot.kinematics import forward
 from envs.grasp.robot.urdf import Box
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import Views, focal_length_px, sample_views
+from envs.grasp.sensors.camera import CameraPoses, focal_length_px, sample_views
 from envs.grasp.settings import Camera, GraspSettings, Support
 from envs.grasp.simulators.factory import make_simulator
 from envs.grasp.simulators.fast import FastSimulator
 from envs.grasp.simulators.kernels.contacts import Room, boxes_meet, cylinder_meets_box
 from envs.grasp.simulators.kernels.noise import fill_normals
 from envs.grasp.simulators.pybullet import PyBulletSimulator
-from envs.grasp.simulators.thread_pool import Team
+from envs.grasp.simulators.thread_pool import ThreadPool
 from envs.grasp.threefry import threefry
 
 ROOT = Path(__file__).parents[4]
@@ -218,7 +218,7 @@ def test_sense_without_noise_is_the_spaces_encoding() -> None:
     depth = simulator.render(np.arange(3), quiet)
     for encoding, range_m in (("uint16", (0.4, 2.0)), ("uint8", (0.5, 1.1))):
         space = DepthImage(80, 80, range_m, encoding)
-        raw = simulator.sense(np.arange(3), quiet, space, seeds)
+        raw = simulator.render_depth(np.arange(3), quiet, space, seeds)
         assert raw.dtype == space.dtype
         assert raw.shape == (3, 80, 80, 1)
         np.testing.assert_array_equal(raw, space.encode(depth))
@@ -231,7 +231,7 @@ def test_noise_has_the_sigma_of_its_view_and_depends_on_the_seed_alone() -> None
     simulator, space = loaded(scenes), DepthImage(80, 80, (0.1, 3.0))
     seeds = np.array([5, 6, 7, 5], np.uint64)
     depth = simulator.render(np.arange(4), noisy)
-    raw = simulator.sense(np.arange(4), noisy, space, seeds)
+    raw = simulator.render_depth(np.arange(4), noisy, space, seeds)
     error = np.where(np.isfinite(depth), raw[..., 0] - 1000.0 * depth, np.nan)
     assert np.nanstd(error[0]) == pytest.approx(2.0, rel=0.05)
     assert np.nanstd(error[1]) == pytest.approx(4.0, rel=0.05)
@@ -240,7 +240,7 @@ def test_noise_has_the_sigma_of_its_view_and_depends_on_the_seed_alone() -> None
     assert np.corrcoef(error[0][both], error[3][both])[0, 1] > 0.95  # but for the rounding
     both = np.isfinite(error[0]) & np.isfinite(error[1])
     assert abs(np.corrcoef(error[0][both], error[1][both])[0, 1]) < 0.06
-    alone = simulator.sense(np.array([1, 3]), noisy[[1, 3]], space, seeds[[1, 3]])
+    alone = simulator.render_depth(np.array([1, 3]), noisy[[1, 3]], space, seeds[[1, 3]])
     np.testing.assert_array_equal(alone, raw[[1, 3]])
 
 
@@ -380,14 +380,14 @@ def test_shapes_meet_where_their_distance_vanishes(is_cylinder: bool) -> None:
 # -- many worlds -----------------------------------------------------------------------------------
 
 
-def everything(simulator: FastSimulator, scenes: Scenes, views: dict[str, Views]) -> list:
+def everything(simulator: FastSimulator, scenes: Scenes, views: dict[str, CameraPoses]) -> list:
     index, seeds = np.arange(len(scenes)), np.arange(len(scenes)).astype(np.uint64)
     contacts = simulator.move(index, reaching(scenes))
     return [
         contacts.touched,
         contacts.collided,
         *(simulator.render(index, view) for view in views.values()),
-        simulator.sense(index, views["depth"], DepthImage(21, 33), seeds),
+        simulator.render_depth(index, views["depth"], DepthImage(21, 33), seeds),
     ]
 
 
@@ -413,7 +413,7 @@ def test_results_do_not_depend_on_threads_nor_on_the_company() -> None:
 @pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("rows", [0, 1, 8, 9, 100, 1023])
 def test_a_team_does_every_row_once(threads: int, rows: int) -> None:
-    team, done = Team(threads), np.zeros(rows, int)
+    team, done = ThreadPool(threads), np.zeros(rows, int)
 
     def work(begin: int, end: int) -> None:
         assert 0 <= begin <= end <= rows
@@ -426,7 +426,7 @@ def test_a_team_does_every_row_once(threads: int, rows: int) -> None:
 
 
 def test_a_teams_members_work_at_the_same_time_and_their_errors_are_passed_on() -> None:
-    team, meeting = Team(2), threading.Barrier(2, timeout=10.0)
+    team, meeting = ThreadPool(2), threading.Barrier(2, timeout=10.0)
     team.share(lambda begin, end: print(meeting.wait()), 16)  # two parts: nobody works alone
 
     def fail(begin: int, end: int) -> None:
@@ -501,11 +501,13 @@ def test_bad_input_is_refused_with_its_name() -> None:
     with pytest.raises(ValueError, match="near_m of the views"):
         simulator.render(both, spoilt(view, "near_m", 9.0))
     with pytest.raises(ValueError, match=r"noise_sigma_m.*finite"):
-        simulator.sense(both, spoilt(view, "noise_sigma_m", np.nan), DepthImage(80, 80), seeds)
+        simulator.render_depth(
+            both, spoilt(view, "noise_sigma_m", np.nan), DepthImage(80, 80), seeds
+        )
     with pytest.raises(ValueError, match=r"DepthImage.*80x80"):
-        simulator.sense(both, view, DepthImage(80, 81), seeds)
+        simulator.render_depth(both, view, DepthImage(80, 81), seeds)
     with pytest.raises(ValueError, match="as many seeds"):
-        simulator.sense(both, view, DepthImage(80, 80), seeds[:1])
+        simulator.render_depth(both, view, DepthImage(80, 80), seeds[:1])
     for wrong in ([0, 2], [1, 0], [0, 0], [-1, 0]):
         with pytest.raises(ValueError, match="indices must rise"):
             simulator.move(np.array(wrong), path)

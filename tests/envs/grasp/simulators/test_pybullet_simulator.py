@@ -14,7 +14,7 @@ from worlds import FIRST, fixed_views, home, pose, reaching, sampled
 
 from encoders.spaces import DepthImage
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import Views, focal_length_px, sample_views, sense_depth
+from envs.grasp.sensors.camera import CameraPoses, focal_length_px, sample_views, sense_depth
 from envs.grasp.settings import Camera, GraspSettings, Support, Workspace
 from envs.grasp.simulators import pybullet as pybullet_module
 from envs.grasp.simulators.factory import make_simulator
@@ -47,7 +47,7 @@ def simulate() -> Iterator[Callable[[Scenes], PyBulletSimulator]]:
 # -- depth -----------------------------------------------------------------------------------------
 
 
-def cast_rays(scenes: Scenes, views: Views) -> tuple[np.ndarray, np.ndarray]:
+def cast_rays(scenes: Scenes, views: CameraPoses) -> tuple[np.ndarray, np.ndarray]:
     """Depth along the optical axis (n, H, W) through the pixels' centres, and what is hit there.
 
     Written from the geometry alone: each ray is turned into each box's frame and clipped there.
@@ -171,7 +171,7 @@ def test_sense_is_the_rendered_depth_with_the_sensors_model(
     scenes, views = sampled(2)
     simulator, space = simulate(scenes), DepthImage(80, 80)
     seeds = np.array([7, 8], np.uint64)
-    raw = simulator.sense(np.arange(2), views["depth"], space, seeds)
+    raw = simulator.render_depth(np.arange(2), views["depth"], space, seeds)
     depth = simulator.render(np.arange(2), views["depth"])
     np.testing.assert_array_equal(raw, sense_depth(depth, space, np.full(2, 0.002), seeds))
     error = raw[..., 0] - 1000 * depth
@@ -211,7 +211,7 @@ def test_color_depends_on_the_light(
     assert red > 1.5 * max(green, blue)  # red, green, blue in this order
 
 
-def _middle_of_face(views: Views) -> tuple[int, int, float]:
+def _middle_of_face(views: CameraPoses) -> tuple[int, int, float]:
     camera = views.camera
     away = np.array([1.05, 0.0, 0.7]) - views.position_m[0]
     x, y, z = away @ views.rotation[0]

@@ -16,7 +16,7 @@ from envs.environment import EnvironmentFailure
 from envs.grasp.robot.kinematics import InverseKinematics
 from envs.grasp.robot.urdf import HOME_JOINTS_RAD, load_robot
 from envs.grasp.scene.sampler import Scenes, SceneSampler
-from envs.grasp.sensors.camera import Views
+from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Camera, GraspSettings, Support
 from envs.grasp.simulators.base import SimulatorError
 from envs.grasp.simulators.pybullet import PyBulletSimulator
@@ -36,13 +36,13 @@ def home(count: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def scenes_and_views() -> tuple[Scenes, dict[str, Views]]:
+def scenes_and_views() -> tuple[Scenes, dict[str, CameraPoses]]:
     settings = GraspSettings(cameras=CAMERAS)
     return SceneSampler(settings).sample(np.random.default_rng(0), np.full(COUNT, np.pi))
 
 
 @pytest.fixture(scope="module")
-def paths(scenes_and_views: tuple[Scenes, dict[str, Views]]) -> np.ndarray:
+def paths(scenes_and_views: tuple[Scenes, dict[str, CameraPoses]]) -> np.ndarray:
     scenes, _ = scenes_and_views
     near = scenes.target_m + np.random.default_rng(1).uniform(-0.05, 0.05, (COUNT, 3))
     joints, _ = InverseKinematics(load_robot())(near, scenes.target_yaw_rad)
@@ -51,7 +51,9 @@ def paths(scenes_and_views: tuple[Scenes, dict[str, Views]]) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def in_process(scenes_and_views: tuple[Scenes, dict[str, Views]]) -> Iterator[PyBulletSimulator]:
+def in_process(
+    scenes_and_views: tuple[Scenes, dict[str, CameraPoses]],
+) -> Iterator[PyBulletSimulator]:
     simulator = PyBulletSimulator(COUNT, Support())
     yield simulator
     simulator.close()
@@ -81,7 +83,7 @@ def runs(pid: int) -> bool:
 def test_results_are_those_of_one_process(
     two_workers: ParallelSimulator,
     in_process: PyBulletSimulator,
-    scenes_and_views: tuple[Scenes, dict[str, Views]],
+    scenes_and_views: tuple[Scenes, dict[str, CameraPoses]],
     paths: np.ndarray,
 ) -> None:
     scenes, views = scenes_and_views
@@ -92,7 +94,7 @@ def test_results_are_those_of_one_process(
         for simulator in (in_process, two_workers):
             simulator.load(index, scenes[index], home(len(index)))
             images = [simulator.render(index, view[index]) for view in views.values()]
-            images.append(simulator.sense(index, views["depth"][index], SPACE, seeds[index]))
+            images.append(simulator.render_depth(index, views["depth"][index], SPACE, seeds[index]))
             contacts = simulator.move(index, paths[index])
             images.append(simulator.render(index, views["rgb"][index]))  # the robot moved
             results.append([contacts.touched, contacts.collided, *images])
@@ -106,7 +108,7 @@ def test_results_are_those_of_one_process(
 
 def test_a_killed_worker_is_named_with_its_signal(
     two_workers: ParallelSimulator,
-    scenes_and_views: tuple[Scenes, dict[str, Views]],
+    scenes_and_views: tuple[Scenes, dict[str, CameraPoses]],
 ) -> None:
     scenes, views = scenes_and_views
     everywhere = np.arange(COUNT)
@@ -120,7 +122,7 @@ def test_a_killed_worker_is_named_with_its_signal(
 
 def test_a_worker_that_dies_at_work_is_noticed(
     two_workers: ParallelSimulator,
-    scenes_and_views: tuple[Scenes, dict[str, Views]],
+    scenes_and_views: tuple[Scenes, dict[str, CameraPoses]],
 ) -> None:
     two_workers.load(np.arange(COUNT), scenes_and_views[0], home(COUNT))
     victim = pids(two_workers)[0]
@@ -135,7 +137,7 @@ def test_a_worker_that_dies_at_work_is_noticed(
 def test_a_workers_exception_is_passed_on_and_leaves_no_answer_behind(
     two_workers: ParallelSimulator,
     in_process: PyBulletSimulator,
-    scenes_and_views: tuple[Scenes, dict[str, Views]],
+    scenes_and_views: tuple[Scenes, dict[str, CameraPoses]],
     paths: np.ndarray,
 ) -> None:
     scenes, views = scenes_and_views
