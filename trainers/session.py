@@ -14,7 +14,7 @@ from curricula.samplers import ParameterValue
 from envs.environment import Environment
 from rewards.reward import RewardTerm
 from trainers.algorithms.base import Algorithm
-from trainers.common.errors import UserError
+from trainers.common.errors import UserError, suggestion
 from trainers.experience.env_runner import EnvRunner, EpisodeBatch
 from trainers.networks.network import (
     DEFAULT_IMAGE_ENCODER,
@@ -23,7 +23,7 @@ from trainers.networks.network import (
     NetworkSettings,
 )
 from trainers.networks.observations import is_frame
-from trainers.runfile.registry import Registries, suggestion
+from trainers.runfile.registry import Registries
 from trainers.runfile.settings import Component, RunSettings
 
 

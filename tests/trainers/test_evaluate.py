@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from envs.grasp.evaluation.report import GraspAlbum
+from envs.grasp.evaluation.report import GraspReport
 from trainers import evaluation
 from trainers.common.errors import UserError
 from trainers.evaluate import main
@@ -22,7 +22,7 @@ GRASP: dict[str, Any] = {
     "num_envs": 4,
     "cameras": {"depth": {"type": "depth", "width": 32, "height": 32}},
 }
-PICTURES = set(GraspAlbum.file_names)
+PICTURES = set(GraspReport.file_names)
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from trainers.algorithms.base import TrainerSettings
 from trainers.algorithms.exploration import GaussianSettings, Noise, NoiseSettings
 from trainers.algorithms.optimization import optimizer_step
 from trainers.algorithms.schedules import CONSTANT, Schedule
+from trainers.common.averager import Averager
 from trainers.common.timers import timed
 from trainers.experience.env_runner import EnvRunner, Step
 from trainers.experience.replay_buffer import ReplayBuffer
@@ -25,7 +26,6 @@ from trainers.networks.actor_critic import to_environment, with_rows
 from trainers.networks.deterministic import DeterministicPolicy, DeterministicSettings
 from trainers.networks.network import NetworkFactory
 from trainers.networks.observations import Observations, gather, to_tensors
-from trainers.reporting.event_log import Averager
 
 
 class DDPGHyperparameters(BaseModel, frozen=True, extra="forbid"):

@@ -12,13 +12,13 @@ from torch import Tensor, nn
 from trainers.algorithms.base import TrainerSettings
 from trainers.algorithms.on_policy import OnPolicyAlgorithm, OnPolicyHyperparameters
 from trainers.algorithms.schedules import CONSTANT, LINEAR, Schedule
+from trainers.common.averager import Averager
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.returns import explained_variance, normalize
 from trainers.experience.rollout import Rollout
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Distribution
 from trainers.networks.network import NetworkFactory
-from trainers.reporting.event_log import Averager
 
 
 class PPOHyperparameters(OnPolicyHyperparameters, frozen=True, extra="forbid"):

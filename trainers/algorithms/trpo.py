@@ -25,13 +25,13 @@ from trainers.algorithms.conjugate_gradient import conjugate_gradient
 from trainers.algorithms.on_policy import OnPolicyAlgorithm, OnPolicyHyperparameters
 from trainers.algorithms.optimization import check_finite
 from trainers.algorithms.schedules import CONSTANT, Schedule
+from trainers.common.averager import Averager
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.returns import explained_variance, normalize
 from trainers.experience.rollout import Rollout
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Distribution
 from trainers.networks.network import NetworkFactory
-from trainers.reporting.event_log import Averager
 
 Product = Callable[[Tensor], Tensor]
 """A matrix, as what it makes of a vector."""

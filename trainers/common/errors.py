@@ -1,5 +1,19 @@
-"""Mistakes of the user's, as opposed to failures of the program."""
+"""Mistakes of the user's, as opposed to failures of the program, and the way out of them."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
 
 
 class UserError(Exception):
     """The user's mistake: the message names it and the way out, and no traceback is shown."""
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Say which known name is meant, or which ones there are."""
+    names = sorted(known)
+    close = difflib.get_close_matches(name, names, n=2)
+    if close:
+        return "did you mean " + " or ".join(f"'{match}'" for match in close) + "?"
+    return f"known: {', '.join(names)}" if names else "none is known"

@@ -11,10 +11,9 @@ import torch
 from pydantic import BaseModel, Field
 from torch import Tensor, nn
 
-from trainers.common.errors import UserError
+from trainers.common.errors import UserError, suggestion
 from trainers.networks.observations import Observations, is_frame
 from trainers.networks.recurrent import MemorySettings, Recurrent, Sequences
-from trainers.runfile.registry import suggestion
 from trainers.runfile.settings import Component
 
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {

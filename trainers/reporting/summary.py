@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from trainers.common.averager import Averager
 from trainers.experience.env_runner import SUCCESS, EpisodeBatch
 from trainers.experience.rollout import frame_spaces
-from trainers.reporting.event_log import Averager, RunLog
+from trainers.reporting.event_log import RunLog
 from trainers.reporting.images import picture
 from trainers.reporting.terminal import RunStatus, TerminalDisplay
 from trainers.session import Session

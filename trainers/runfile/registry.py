@@ -7,7 +7,6 @@ installed; every other plugin is found through the entry-point group `ventosa`.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import importlib.metadata
 from collections.abc import Callable, Iterable, Mapping
@@ -21,7 +20,7 @@ from torch import nn
 
 from envs.environment import Environment
 from trainers import hookspecs
-from trainers.common.errors import UserError
+from trainers.common.errors import UserError, suggestion
 
 BUILT_IN = "built-in"
 BUILT_IN_PLUGINS = (
@@ -269,12 +268,3 @@ RESERVED_KEYS = {"reward": {"type", "weight"}, "trainer": {"trainer_type"}}
 def hook_name(field: str) -> str:
     """Name the hook that fills a field of `Registries`."""
     return f"{hookspecs.PROJECT_NAME}_{field}"
-
-
-def suggestion(name: str, known: Iterable[str]) -> str:
-    """Say which known name is meant, or which ones there are."""
-    names = sorted(known)
-    close = difflib.get_close_matches(name, names, n=2)
-    if close:
-        return "did you mean " + " or ".join(f"'{match}'" for match in close) + "?"
-    return f"known: {', '.join(names)}" if names else "none is known"

@@ -14,7 +14,8 @@ from typing import Any
 from pydantic import BaseModel, Field, TypeAdapter
 
 from curricula.samplers import ParameterValue
-from trainers.runfile.registry import Registries, Registry, UnknownComponentError, suggestion
+from trainers.common.errors import suggestion
+from trainers.runfile.registry import Registries, Registry, UnknownComponentError
 from trainers.runfile.validation import InvalidError, Model, not_finite, validate
 from trainers.runfile.yaml_document import (
     Document,

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from trainers.runfile.registry import suggestion
+from trainers.common.errors import suggestion
 from trainers.runfile.yaml_document import KeyPath, dotted, shown
 
 Model = TypeVar("Model", bound=BaseModel)

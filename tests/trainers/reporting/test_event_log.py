@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from trainers.reporting.event_log import Averager, RunLog
+from trainers.common.averager import Averager
+from trainers.reporting.event_log import RunLog
 
 TAG = "Environment/Cumulative Reward"
 

@@ -1,0 +1,27 @@
+"""Means of named values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+
+class Averager:
+    """Means of named values over everything added since they were last taken."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, float] = {}
+        self._counts: dict[str, int] = {}
+
+    def add(self, values: Mapping[str, float], count: int = 1) -> None:
+        """Add values; each is itself the mean of `count` samples (none are added if it is 0)."""
+        if count == 0:
+            return
+        for name, value in values.items():
+            self._sums[name] = self._sums.get(name, 0.0) + float(value) * count
+            self._counts[name] = self._counts.get(name, 0) + count
+
+    def pop_means(self) -> dict[str, float]:
+        """The mean of each name that got a value; then start anew."""
+        means = {name: total / self._counts[name] for name, total in self._sums.items()}
+        self._sums, self._counts = {}, {}
+        return means
