@@ -37,7 +37,7 @@ from trainers.evaluation import FIRST_SEED, final_parameters
 from trainers.learn import DONE, MISTAKE
 from trainers.networks.actor_critic import ActorCritic, to_environment
 from trainers.networks.deterministic import DeterministicActorCritic
-from trainers.networks.network import NetworkFactory
+from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import to_tensors
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import RunSettings, load_run

@@ -22,15 +22,15 @@ from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel
 
 from encoders.spaces import DepthImage
-from encoders.vector import Vector
 from envs.environment import Environment
 from rewards.reward import RewardTerm
 from trainers import run as run_module
 from trainers.algorithms.ppo import PPO
 from trainers.algorithms.trpo import TRPO
 from trainers.hookspecs import hookimpl
+from trainers.inference.construction import network_factory
 from trainers.learn import main
-from trainers.networks.network import NetworkFactory, NetworkSettings
+from trainers.networks.factory import NetworkFactory
 from trainers.runfile.registry import BUILT_IN_PLUGINS, Registries, load_registries, plugin_manager
 from trainers.runfile.settings import Component, RunSettings, load_run
 from trainers.session import Session
@@ -319,12 +319,8 @@ def scripted() -> type[ScriptedEnvironment]:
     return ScriptedEnvironment
 
 
-def default_encoder(space: gymnasium.Space[Any], settings: NetworkSettings) -> Component:
-    return Component("vector", Vector, Vector.Settings(normalize=settings.normalize))
-
-
 @pytest.fixture(scope="session")
-def make_factory() -> Callable[..., NetworkFactory]:
+def make_factory(registries: Registries) -> Callable[..., NetworkFactory]:
     """Builds a `NetworkFactory`; vectors need no encoder, images do."""
 
     def make(
@@ -332,11 +328,12 @@ def make_factory() -> Callable[..., NetworkFactory]:
         encoders: Mapping[str, Component] | None = None,
         action_space: gymnasium.Space[Any] | None = None,
     ) -> NetworkFactory:
-        return NetworkFactory(
+        return network_factory(
             gymnasium.spaces.Dict(dict(space)),
             action_space or Box(-1.0, 1.0, (1,), np.float32),
+            frozenset({"privileged"}),
             encoders or {},
-            default_encoder,
+            registries.encoders,
         )
 
     return make

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import gymnasium
 import torch
 from torch import Tensor
 
@@ -16,15 +15,12 @@ from rewards.reward import RewardTerm
 from trainers.algorithms.base import Algorithm
 from trainers.common.errors import UserError, suggestion
 from trainers.experience.env_runner import EnvRunner, EpisodeBatch
-from trainers.networks.network import (
-    DEFAULT_IMAGE_ENCODER,
-    DEFAULT_VECTOR_ENCODER,
-    NetworkFactory,
-    NetworkSettings,
-)
-from trainers.networks.observations import is_frame
+from trainers.inference.construction import network_factory
+from trainers.networks.factory import NetworkFactory
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import Component, RunSettings
+
+PRIVILEGED = frozenset({"privileged"})
 
 
 class Session:
@@ -186,13 +182,10 @@ def _build(component: Component, path: str, *rest: Any) -> Any:
 
 def build_factory(run: RunSettings, registries: Registries, env: Environment) -> NetworkFactory:
     """What builds the networks of the run."""
-
-    def default_encoder(space: gymnasium.Space[Any], settings: NetworkSettings) -> Component:
-        name = DEFAULT_IMAGE_ENCODER if is_frame(space) else DEFAULT_VECTOR_ENCODER
-        entry = registries.encoders.get(name)
-        options = {} if is_frame(space) else {"normalize": settings.normalize}
-        return Component(name, entry.cls, entry.settings(**options))
-
-    return NetworkFactory(
-        env.single_observation_space, env.single_action_space, run.encoders, default_encoder
+    return network_factory(
+        env.single_observation_space,
+        env.single_action_space,
+        PRIVILEGED,
+        run.encoders,
+        registries.encoders,
     )

@@ -24,7 +24,7 @@ from trainers.experience.env_runner import EnvRunner, Step
 from trainers.experience.replay_buffer import ReplayBuffer
 from trainers.networks.actor_critic import to_environment, with_rows
 from trainers.networks.deterministic import DeterministicPolicy, DeterministicSettings
-from trainers.networks.network import NetworkFactory
+from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import Observations, gather, to_tensors
 
 

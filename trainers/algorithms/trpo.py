@@ -31,7 +31,7 @@ from trainers.experience.returns import explained_variance, normalize
 from trainers.experience.rollout import Rollout
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Distribution
-from trainers.networks.network import NetworkFactory
+from trainers.networks.factory import NetworkFactory
 
 Product = Callable[[Tensor], Tensor]
 """A matrix, as what it makes of a vector."""

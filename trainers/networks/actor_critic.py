@@ -15,7 +15,8 @@ from torch import Tensor, nn
 
 from trainers.common.errors import UserError
 from trainers.networks.distributions import Categorical, DiagonalGaussian, Distribution
-from trainers.networks.network import NetworkFactory, NetworkSettings, head
+from trainers.networks.factory import NetworkFactory
+from trainers.networks.network import NetworkSettings, head
 from trainers.networks.observations import Observations
 from trainers.networks.recurrent import MemorySettings
 
@@ -231,7 +232,9 @@ def observed(
         UserError: the environment does not have them.
     """
     everything = tuple(factory.observation_space.spaces)
-    actor = settings.actor_observations or tuple(n for n in everything if n != "privileged")
+    actor = settings.actor_observations or tuple(
+        name for name in everything if name not in factory.privileged
+    )
     critic = settings.critic_observations or actor
     for path, names in (("actor_observations", actor), ("critic_observations", critic)):
         for name in names:

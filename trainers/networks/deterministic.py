@@ -14,7 +14,8 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from trainers.common.errors import UserError
 from trainers.networks.actor_critic import ACTOR_GAIN, CRITIC_GAIN, ActorCriticSettings, observed
-from trainers.networks.network import Network, NetworkFactory, NetworkSettings, head, hidden_layers
+from trainers.networks.factory import NetworkFactory
+from trainers.networks.network import Network, NetworkSettings, head, hidden_layers
 from trainers.networks.observations import Observations
 
 ENCODERS_ALONE = {"num_layers": 0}

@@ -11,10 +11,8 @@ import torch
 from pydantic import BaseModel, Field
 from torch import Tensor, nn
 
-from trainers.common.errors import UserError, suggestion
 from trainers.networks.observations import Observations, is_frame
 from trainers.networks.recurrent import MemorySettings, Recurrent, Sequences
-from trainers.runfile.settings import Component
 
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
     "relu": nn.ReLU,
@@ -22,8 +20,6 @@ ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
     "silu": nn.SiLU,
     "elu": nn.ELU,
 }
-DEFAULT_IMAGE_ENCODER = "simple"
-DEFAULT_VECTOR_ENCODER = "vector"
 
 
 class NetworkSettings(BaseModel, frozen=True, extra="forbid"):
@@ -149,69 +145,6 @@ class Network(nn.Module):
         for name, encoder in self.vector_encoders.items():
             if name in vectors and isinstance(encoder, Standardizing):
                 encoder.update_statistics(vectors[name])
-
-
-class NetworkFactory:
-    """Builds networks for one run: it knows the spaces and the run file's encoders.
-
-    Args:
-        observation_space: of one environment.
-        action_space: of one environment.
-        encoders: the run file's, by the name of the observation.
-        defaults: the encoder of an observation the run file does not mention, by its space and the
-            network's settings.
-    """
-
-    def __init__(
-        self,
-        observation_space: gymnasium.spaces.Dict,
-        action_space: gymnasium.Space[Any],
-        encoders: Mapping[str, Component],
-        defaults: Callable[[gymnasium.Space[Any], NetworkSettings], Component],
-    ):
-        self.observation_space = observation_space
-        self.action_space = action_space
-        self._encoders, self._defaults = encoders, defaults
-        for name in encoders:
-            self.check_name(name, "encoders")
-
-    def check_name(self, name: str, path: str) -> None:
-        """Refuses observations the environment does not have."""
-        if name not in self.observation_space.spaces:
-            raise UserError(
-                f"{path}: the environment has no observation {name!r}; "
-                f"{suggestion(name, self.observation_space.spaces)}"
-            )
-
-    def network(
-        self,
-        settings: NetworkSettings,
-        names: Sequence[str],
-        memory: MemorySettings | None = None,
-    ) -> Network:
-        """A new network on some of the observations.
-
-        Args:
-            settings: what follows the encoders.
-            names: of the observations.
-            memory: what follows the trunk, if anything.
-
-        Raises:
-            UserError: an encoder does not fit its observation.
-        """
-        spaces = {name: self.observation_space[name] for name in names}
-        encoders = {name: self._encoder(name, space, settings) for name, space in spaces.items()}
-        return Network(encoders, spaces, settings, memory)
-
-    def _encoder(
-        self, name: str, space: gymnasium.Space[Any], settings: NetworkSettings
-    ) -> nn.Module:
-        component = self._encoders.get(name) or self._defaults(space, settings)
-        try:
-            encoder: nn.Module = component.cls(space, component.settings)
-        except ValueError as error:
-            raise UserError(f"encoders.{name} ({component.name}): {error}") from error
-        return encoder
 
 
 def _joined(parts: Sequence[Tensor]) -> Tensor:

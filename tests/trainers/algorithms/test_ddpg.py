@@ -19,7 +19,7 @@ from trainers.algorithms.ddpg import DDPG, DDPGHyperparameters, DDPGSettings
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner, NonFiniteError, concatenate
 from trainers.networks.deterministic import DeterministicPolicy, DeterministicSettings
-from trainers.networks.network import NetworkFactory
+from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import Observations, to_tensors
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings

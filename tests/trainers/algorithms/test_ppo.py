@@ -27,7 +27,7 @@ from trainers.algorithms.ppo import (
 )
 from trainers.experience.env_runner import EnvRunner, NonFiniteError, concatenate
 from trainers.networks.distributions import Categorical, DiagonalGaussian
-from trainers.networks.network import NetworkFactory
+from trainers.networks.factory import NetworkFactory
 from trainers.session import Session
 
 MakePPO = Callable[..., PPO]

@@ -33,7 +33,7 @@ from trainers.algorithms.trpo import (
 from trainers.experience.env_runner import EnvRunner, NonFiniteError, concatenate
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Categorical, DiagonalGaussian, Distribution
-from trainers.networks.network import NetworkFactory
+from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import Observations
 from trainers.runfile.settings import Component, SettingsError
 

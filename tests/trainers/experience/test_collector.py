@@ -19,7 +19,7 @@ from trainers.experience.env_runner import EnvRunner
 from trainers.experience.reward_normalizer import RewardNormalizer
 from trainers.experience.rollout import Rollout
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
-from trainers.networks.network import NetworkFactory
+from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import Observations
 from trainers.networks.recurrent import Sequences
 from trainers.runfile.settings import Component

@@ -25,7 +25,7 @@ from trainers.networks.actor_critic import (
     to_environment,
 )
 from trainers.networks.distributions import Categorical, DiagonalGaussian
-from trainers.networks.network import NetworkFactory
+from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import Observations
 from trainers.networks.recurrent import Sequences
 from trainers.runfile.settings import Component

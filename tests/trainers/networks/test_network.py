@@ -15,7 +15,8 @@ from encoders.conv import Conv
 from encoders.spaces import RgbImage
 from encoders.vector import Vector
 from trainers.common.errors import UserError
-from trainers.networks.network import Network, NetworkFactory, NetworkSettings, head
+from trainers.networks.factory import NetworkFactory
+from trainers.networks.network import Network, NetworkSettings, head
 from trainers.networks.observations import Observations
 from trainers.runfile.settings import Component
 

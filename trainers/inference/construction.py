@@ -1,0 +1,65 @@
+"""From settings to what builds networks: the encoder of each observation, by the run file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+from torch import nn
+
+from trainers.common.errors import UserError
+from trainers.networks.factory import NetworkFactory
+from trainers.networks.network import NetworkSettings
+from trainers.networks.observations import is_frame
+from trainers.runfile.registry import Registry
+from trainers.runfile.settings import Component
+
+DEFAULT_IMAGE_ENCODER = "simple"
+DEFAULT_VECTOR_ENCODER = "vector"
+
+
+def network_factory(
+    observation_space: gymnasium.spaces.Dict,
+    action_space: gymnasium.Space[Any],
+    privileged: frozenset[str],
+    encoders: Mapping[str, Component],
+    registry: Registry,
+) -> NetworkFactory:
+    """What builds the networks of a run, or of a saved policy.
+
+    Args:
+        observation_space: of one environment.
+        action_space: of one environment.
+        privileged: names of the observations that only a critic may see.
+        encoders: the run file's, by the name of the observation.
+        registry: of encoders, where that of an observation which the run file does not mention is
+            found.
+
+    Raises:
+        UserError: the run file names an observation that there is not.
+    """
+
+    def build_encoder(
+        name: str, space: gymnasium.Space[Any], settings: NetworkSettings
+    ) -> nn.Module:
+        component = encoders.get(name) or _default_encoder(space, settings, registry)
+        try:
+            encoder: nn.Module = component.cls(space, component.settings)
+        except ValueError as error:
+            raise UserError(f"encoders.{name} ({component.name}): {error}") from error
+        return encoder
+
+    factory = NetworkFactory(observation_space, action_space, build_encoder, privileged)
+    for name in encoders:
+        factory.check_name(name, "encoders")
+    return factory
+
+
+def _default_encoder(
+    space: gymnasium.Space[Any], settings: NetworkSettings, registry: Registry
+) -> Component:
+    name = DEFAULT_IMAGE_ENCODER if is_frame(space) else DEFAULT_VECTOR_ENCODER
+    entry = registry.get(name)
+    options = {} if is_frame(space) else {"normalize": settings.normalize}
+    return Component(name, entry.cls, entry.settings(**options))
