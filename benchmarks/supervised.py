@@ -35,7 +35,8 @@ from trainers.algorithms.trpo import TRPOSettings
 from trainers.common.errors import UserError
 from trainers.evaluation import FIRST_SEED, final_parameters
 from trainers.learn import DONE, MISTAKE
-from trainers.networks.actor_critic import ActorCritic, to_environment
+from trainers.networks.actions import to_environment
+from trainers.networks.actor_critic import ActorCritic
 from trainers.networks.deterministic import DeterministicActorCritic
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import to_tensors

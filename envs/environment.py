@@ -79,11 +79,13 @@ class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     Attributes:
         Settings: the model of the run file's `environment` section.
         parameter_names: the environment parameters that curricula and samplers may set.
+        privileged: names of the observations that only a critic may see.
         evaluation_episodes: how many an evaluation plays unless it is told otherwise.
     """
 
     Settings: ClassVar[type[BaseModel]]
     parameter_names: ClassVar[frozenset[str]] = frozenset()
+    privileged: frozenset[str] = frozenset()
     evaluation_episodes: ClassVar[int] = 100
     single_observation_space: gymnasium.spaces.Dict
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012

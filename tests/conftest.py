@@ -57,6 +57,7 @@ class ToyEnvironment(Environment):
         spaces: dict[str, gymnasium.Space[Any]] = dict(self.spaces())
         if settings.privileged:
             spaces["privileged"] = Box(-np.inf, np.inf, (1,), np.float32)
+            self.privileged = frozenset({"privileged"})
         self.single_observation_space = gymnasium.spaces.Dict(spaces)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)

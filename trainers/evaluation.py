@@ -19,7 +19,7 @@ from envs.environment import Environment, EvaluationReport, PhysicalCheck
 from trainers.algorithms.base import Algorithm
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import SUCCESS, EnvRunner, EpisodeBatch, Step, concatenate
-from trainers.networks.actor_critic import to_environment
+from trainers.networks.actions import to_environment
 from trainers.networks.observations import to_tensors
 from trainers.networks.recurrent import Sequences
 from trainers.runfile.registry import Registries, load_registries
@@ -145,7 +145,7 @@ class _Player:
             self._generator,
             torch.device("cpu"),
         )
-        self._remembered = self._algorithm.initial_state(env.num_envs)
+        self._remembered = self._algorithm.policy.initial_state(env.num_envs)
 
     def load(self, weights: dict[str, torch.Tensor], where: str) -> None:
         """Takes over weights."""
@@ -158,7 +158,7 @@ class _Player:
     def reset(self) -> None:
         """Begins an episode everywhere."""
         self.env_runner.reset()
-        self._remembered = self._algorithm.initial_state(self.env_runner.env.num_envs)
+        self._remembered = self._algorithm.policy.initial_state(self.env_runner.env.num_envs)
 
     @torch.no_grad()
     def actions(self, *, deterministic: bool) -> NDArray[Any]:
@@ -166,9 +166,10 @@ class _Player:
         env = self.env_runner.env
         space = env.single_observation_space
         observations = to_tensors(self.env_runner.observations, space, torch.device("cpu"))
-        actions, self._remembered = self._algorithm.act(
+        actions, self._remembered = self._algorithm.policy.act(
             replace(observations, sequences=Sequences.single(self._remembered)),
             deterministic=deterministic,
+            generator=self._generator,
         )
         return to_environment(actions, env.single_action_space)
 

@@ -20,8 +20,6 @@ from trainers.networks.factory import NetworkFactory
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import Component, RunSettings
 
-PRIVILEGED = frozenset({"privileged"})
-
 
 class Session:
     """Everything that acts in a run, and the state it goes on from.
@@ -185,7 +183,7 @@ def build_factory(run: RunSettings, registries: Registries, env: Environment) ->
     return network_factory(
         env.single_observation_space,
         env.single_action_space,
-        PRIVILEGED,
+        env.privileged,
         run.encoders,
         registries.encoders,
     )

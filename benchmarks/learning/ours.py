@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import closing
-from typing import Any
-
-import torch
-from numpy.typing import NDArray
 
 from benchmarks.learning.evaluation import Act, Referee
-from trainers.networks.actor_critic import to_environment
-from trainers.networks.observations import to_tensors
+from trainers.inference.policy import Policy
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings
 from trainers.session import Session
@@ -36,11 +30,5 @@ def learn(run: RunSettings, registries: Registries, referee: Referee) -> Act:
 def policy_of(session: Session) -> Act:
     """The session's deterministic policy, which goes on learning with it."""
     env = session.env_runner.env
-
-    @torch.no_grad()
-    def act(raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        observations = to_tensors(raw, env.single_observation_space, torch.device("cpu"))
-        actions, _ = session.algorithm.act(observations, deterministic=True)
-        return to_environment(actions, env.single_action_space)
-
-    return act
+    policy = Policy(session.algorithm.policy, env.single_observation_space, env.single_action_space)
+    return lambda observations: policy.predict(observations)[0]

@@ -68,6 +68,7 @@ class GraspVectorEnv(Environment):
         self.num_envs = settings.num_envs
         self.single_action_space = Box(-1.0, 1.0, (4,), np.float32)
         self.single_observation_space = observation_space(settings)
+        self.privileged = frozenset({PRIVILEGED}) & self.single_observation_space.keys()
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._parameters: dict[str, ParameterValue] = {}

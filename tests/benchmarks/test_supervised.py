@@ -24,9 +24,9 @@ def test_right_actions_succeed_on_the_last_lesson() -> None:
     env.reset(seed=0)
     *_, infos = env.step_without_reset(fit.right_actions(env))
     env.close()
-    assert infos["measures"]["success"].all()
-    assert infos["measures"]["position_error_m"].max() < 1e-6
-    assert infos["measures"]["yaw_error_deg"].max() < 1e-4
+    assert infos["episode_metrics"]["success"].all()
+    assert infos["episode_metrics"]["position_error_m"].max() < 1e-6
+    assert infos["episode_metrics"]["yaw_error_deg"].max() < 1e-4
 
 
 def test_the_tolerances_are_the_goal_regions_in_actions() -> None:

@@ -14,8 +14,8 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
-from trainers.algorithms.ppo import PPO
 from trainers.evaluate import main
+from trainers.networks.actor_critic import ActorCritic
 from trainers.networks.observations import Observations
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings
@@ -129,15 +129,15 @@ def ages(monkeypatch: pytest.MonkeyPatch) -> list[list[float]]:
     ages: list[list[float]] = []
 
     def count_steps(
-        algorithm: PPO, observations: Observations, *, deterministic: bool
+        policy: ActorCritic, observations: Observations, *, deterministic: bool, generator: Any
     ) -> tuple[Tensor, Tensor]:
         assert observations.sequences is not None
         state = observations.sequences.state
         ages.append(state.flatten().tolist())
-        return torch.zeros(len(state), *algorithm.policy.action_head.bias.shape), state + 1.0
+        return torch.zeros(len(state), *policy.action_head.bias.shape), state + 1.0
 
-    monkeypatch.setattr(PPO, "initial_state", lambda algorithm, count: torch.zeros(count, 1))
-    monkeypatch.setattr(PPO, "act", count_steps)
+    monkeypatch.setattr(ActorCritic, "initial_state", lambda policy, count: torch.zeros(count, 1))
+    monkeypatch.setattr(ActorCritic, "act", count_steps)
     return ages
 
 

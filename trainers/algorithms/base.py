@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from pydantic import BaseModel, Field
-from torch import Tensor, nn
+from torch import Tensor
 
-from trainers.networks.observations import Observations
+from trainers.networks.factory import NetworkFactory
+from trainers.networks.policy_network import PolicyNetwork
 
 
 class TrainerSettings(BaseModel, frozen=True, extra="forbid"):
@@ -29,33 +30,35 @@ class Algorithm(Protocol):
     own settings, an `EnvRunner`, the source of its randomness and the torch device.
 
     Attributes:
-        policy: what is saved as the weights, and evaluated.
+        Settings: its model, of `TrainerSettings`.
+        policy: what acts, and what is saved as the weights.
     """
 
-    policy: nn.Module
+    Settings: ClassVar[type[TrainerSettings]]
+    policy: PolicyNetwork
 
-    def initial_state(self, count: int) -> Tensor:
-        """What the policy remembers where episodes begin, (count, m); m is 0 without memory."""
+    @staticmethod
+    def build_policy(factory: NetworkFactory, settings: Any) -> PolicyNetwork:
+        """A new policy, whose weights are those of `policy`.
 
-    def act(self, observations: Observations, *, deterministic: bool) -> tuple[Tensor, Tensor]:
-        """Acts for evaluation.
+        All that acting needs: no optimizer, no experience, no environment.
 
         Args:
-            observations: B observations, with what is remembered before them.
-            deterministic: the policy's best action, or one drawn as at the end of training.
+            factory: builds its networks.
+            settings: the algorithm's.
 
-        Returns:
-            Actions (B, ...), and what is to be remembered of each, (B, m).
+        Raises:
+            UserError: the settings don't fit what is observed or done.
         """
 
     def collect(self) -> None:
-        """Plays until there is enough experience for an update; changes no weights."""
+        """Steps the environments until there is enough for an update; changes no weights."""
 
-    def update(self, progress: float) -> Mapping[str, float]:
+    def update(self, run_fraction: float) -> Mapping[str, float]:
         """Learns from what was collected.
 
         Args:
-            progress: the share of the run that is over, in [0, 1], for schedules.
+            run_fraction: the share of the run that is over, in [0, 1], for schedules.
 
         Returns:
             Statistics by their TensorBoard tag.

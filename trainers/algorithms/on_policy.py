@@ -11,12 +11,11 @@ from torch import Tensor, nn
 
 from trainers.algorithms.optimization import optimizer_step
 from trainers.algorithms.schedules import LINEAR, Schedule
-from trainers.experience.collector import OnPolicyCollector
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.reward_normalizer import RewardNormalizer
 from trainers.experience.rollout import Rollout
+from trainers.experience.rollout_collector import RolloutCollector
 from trainers.networks.actor_critic import ActorCritic
-from trainers.networks.observations import Observations
 
 
 class OnPolicyHyperparameters(BaseModel, frozen=True, extra="forbid"):
@@ -44,7 +43,7 @@ class OnPolicyHyperparameters(BaseModel, frozen=True, extra="forbid"):
 
 
 class OnPolicyAlgorithm:
-    """Acts, collects, descends gradients and keeps the state; a subclass says how to update.
+    """Collects rollouts, takes optimizer steps and keeps the state; a subclass says how to update.
 
     Args:
         policy: the actor and the critic, on the device.
@@ -71,7 +70,7 @@ class OnPolicyAlgorithm:
         )
         self._gamma, self._lambd = hyperparameters.gamma, hyperparameters.lambd
         count = env_runner.env.num_envs
-        self._collector = OnPolicyCollector(
+        self._collector = RolloutCollector(
             policy,
             env_runner,
             -(-hyperparameters.buffer_size // count),
@@ -82,16 +81,6 @@ class OnPolicyAlgorithm:
         self._max_gradient_norm = hyperparameters.max_gradient_norm
         self._env_runner, self._generator = env_runner, generator
         self._rollout: Rollout | None = None
-
-    def initial_state(self, count: int) -> Tensor:
-        """See `Algorithm.initial_state`."""
-        return self.policy.initial_state(count)
-
-    def act(self, observations: Observations, *, deterministic: bool) -> tuple[Tensor, Tensor]:
-        """See `Algorithm.act`."""
-        distribution, _, state = self.policy.step(observations)
-        actions = distribution.mode() if deterministic else distribution.sample(self._generator)
-        return actions, state
 
     def collect(self) -> None:
         """See `Algorithm.collect`."""

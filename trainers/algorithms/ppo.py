@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from itertools import chain
 
 import torch
@@ -19,6 +20,14 @@ from trainers.experience.rollout import Rollout
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Distribution
 from trainers.networks.factory import NetworkFactory
+
+STATISTICS = (
+    "Policy/KL",
+    "Policy/Clip Fraction",
+    "Losses/Policy Loss",
+    "Losses/Value Loss",
+    "Policy/Entropy",
+)
 
 
 class PPOHyperparameters(OnPolicyHyperparameters, frozen=True, extra="forbid"):
@@ -53,6 +62,16 @@ class PPOSettings(TrainerSettings, frozen=True, extra="forbid"):
     )
 
 
+@dataclass(frozen=True)
+class _Scheduled:
+    """What changes over the run, as it is in one update."""
+
+    learning_rate: float
+    critic_learning_rate: float
+    epsilon: float
+    beta: float
+
+
 class PPO(OnPolicyAlgorithm):
     """PPO with a clipped objective. See `trainers.algorithms.base.Algorithm`."""
 
@@ -67,7 +86,7 @@ class PPO(OnPolicyAlgorithm):
         device: torch.device,
     ):
         self._hyperparameters = settings.hyperparameters
-        policy = ActorCritic(factory, settings.network_settings).to(device)
+        policy = self.build_policy(factory, settings).to(device)
         actor, critic = policy.actor_parameters(), policy.critic_parameters()
         # A step of the optimiser costs by the group: one where actor and critic share their rate.
         groups: tuple[Iterable[nn.Parameter], ...] = (chain(actor, critic),)
@@ -75,52 +94,64 @@ class PPO(OnPolicyAlgorithm):
             groups = (actor, critic)
         super().__init__(policy, groups, settings.hyperparameters, env_runner, generator, device)
 
-    def update(self, progress: float) -> Mapping[str, float]:
+    @staticmethod
+    def build_policy(factory: NetworkFactory, settings: PPOSettings) -> ActorCritic:
+        """See `Algorithm.build_policy`."""
+        return ActorCritic(factory, settings.network_settings)
+
+    def update(self, run_fraction: float) -> Mapping[str, float]:
         """See `Algorithm.update`."""
         rollout = self._pop_rollout()
-        schedules = self._set_schedules(progress)
+        scheduled = self._schedule(run_fraction)
         advantages = normalize(rollout.advantages)
         averager = Averager()
         for _ in range(self._hyperparameters.num_epoch):
-            if not self._epoch(rollout, advantages, schedules, averager):
+            if not self._epoch(rollout, advantages, scheduled, averager):
                 break
         self.policy.update_statistics(rollout.vectors)
-        statistics = averager.pop_means()
         variance = explained_variance(rollout.returns, rollout.values)
-        return statistics | schedules | {"Policy/Explained Variance": variance}
-
-    def _set_schedules(self, progress: float) -> dict[str, float]:
-        hyper = self._hyperparameters
-        rate = hyper.learning_rate_schedule.value(hyper.learning_rate, progress)
-        critic_rate = hyper.learning_rate_schedule.value(
-            hyper.critic_learning_rate or hyper.learning_rate, progress
-        )
-        for group, value in zip(self._optimizer.param_groups, (rate, critic_rate), strict=False):
-            group["lr"] = value
-        return {
-            "Policy/Learning Rate": rate,
-            "Policy/Critic Learning Rate": critic_rate,
-            "Policy/Epsilon": hyper.epsilon_schedule.value(hyper.epsilon, progress),
-            "Policy/Beta": hyper.beta_schedule.value(hyper.beta, progress),
+        return averager.pop_means() | {
+            "Policy/Learning Rate": scheduled.learning_rate,
+            "Policy/Critic Learning Rate": scheduled.critic_learning_rate,
+            "Policy/Epsilon": scheduled.epsilon,
+            "Policy/Beta": scheduled.beta,
+            "Policy/Explained Variance": variance,
         }
+
+    def _schedule(self, run_fraction: float) -> _Scheduled:
+        hyper = self._hyperparameters
+        rates = hyper.learning_rate_schedule
+        scheduled = _Scheduled(
+            learning_rate=rates.value(hyper.learning_rate, run_fraction),
+            critic_learning_rate=rates.value(
+                hyper.critic_learning_rate or hyper.learning_rate, run_fraction
+            ),
+            epsilon=hyper.epsilon_schedule.value(hyper.epsilon, run_fraction),
+            beta=hyper.beta_schedule.value(hyper.beta, run_fraction),
+        )
+        # One group where actor and critic share their rate.
+        learning_rates = (scheduled.learning_rate, scheduled.critic_learning_rate)
+        for group, rate in zip(self._optimizer.param_groups, learning_rates, strict=False):
+            group["lr"] = rate
+        return scheduled
 
     def _epoch(
         self,
         rollout: Rollout,
         advantages: Tensor,
-        schedules: dict[str, float],
+        scheduled: _Scheduled,
         averager: Averager,
     ) -> bool:
         """One pass over the rollout; False once the policy has moved far enough."""
         hyper = self._hyperparameters
         for rows in rollout.minibatches(hyper.batch_size, self._generator):
             distribution, values = self.policy(rollout.observations(rows))
-            policy_loss, statistics = surrogate_loss(
+            policy_loss, divergence, clip_fraction = surrogate_loss(
                 distribution,
                 rollout.actions[rows],
                 rollout.log_probs[rows],
                 advantages[rows],
-                schedules["Policy/Epsilon"],
+                scheduled.epsilon,
             )
             value_loss = clipped_value_loss(
                 values, rollout.values[rows], rollout.returns[rows], hyper.value_clipping
@@ -128,23 +159,15 @@ class PPO(OnPolicyAlgorithm):
             entropy = distribution.entropy().mean()
             # L = L_clip + c_v L_value - beta H + c_kl KL
             loss = policy_loss + hyper.value_coefficient * value_loss
-            for weight, term in (
-                (-schedules["Policy/Beta"], entropy),
-                (hyper.kl_penalty, statistics["Policy/KL"]),
-            ):
+            for weight, term in ((-scheduled.beta, entropy), (hyper.kl_penalty, divergence)):
                 if weight:  # the gradient of what weighs nothing costs as much as any
                     loss = loss + weight * term
             self._optimizer_step(loss)
-            statistics |= {
-                "Losses/Policy Loss": policy_loss,
-                "Losses/Value Loss": value_loss,
-                "Policy/Entropy": entropy,
-            }
             # All at once: on an accelerator each look at a number waits for all that is under way.
-            numbers = torch.stack(list(statistics.values())).tolist()
-            means = dict(zip(statistics, numbers, strict=True))
-            averager.add(means, len(rows))
-            if hyper.target_kl is not None and means["Policy/KL"] > hyper.target_kl:
+            statistics = torch.stack((divergence, clip_fraction, policy_loss, value_loss, entropy))
+            means = statistics.tolist()
+            averager.add(dict(zip(STATISTICS, means, strict=True)), len(rows))
+            if hyper.target_kl is not None and means[0] > hyper.target_kl:
                 return False
         return True
 
@@ -155,7 +178,7 @@ def surrogate_loss(
     old_log_probs: Tensor,
     advantages: Tensor,
     epsilon: float,
-) -> tuple[Tensor, dict[str, Tensor]]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """PPO's clipped objective, negated (Schulman et al. 2017, eq. 7), with its diagnostics.
 
     Args:
@@ -164,6 +187,9 @@ def surrogate_loss(
         old_log_probs: (B,) under the old policy.
         advantages: (B,).
         epsilon: how far the ratio may move from 1.
+
+    Returns:
+        The loss, the mean KL(old || new), and the share of ratios beyond epsilon.
     """
     log_ratio = distribution.log_prob(actions) - old_log_probs
     ratio = log_ratio.exp()
@@ -173,7 +199,7 @@ def surrogate_loss(
     # KL(old || new) = E_old[(r - 1) - log r]: never negative, and of low variance.
     divergence = ((ratio - 1.0) - log_ratio).mean()
     clip_fraction = ((ratio.detach() - 1.0).abs() > epsilon).float().mean()
-    return loss, {"Policy/KL": divergence, "Policy/Clip Fraction": clip_fraction}
+    return loss, divergence, clip_fraction
 
 
 def clipped_value_loss(

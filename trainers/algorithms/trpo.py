@@ -104,28 +104,32 @@ class TRPO(OnPolicyAlgorithm):
         device: torch.device,
     ):
         self._hyperparameters = settings.hyperparameters
-        policy = ActorCritic(factory, settings.network_settings).to(device)
+        policy = self.build_policy(factory, settings).to(device)
         groups = (policy.critic_parameters(),)
         super().__init__(policy, groups, settings.hyperparameters, env_runner, generator, device)
         self._theta = [p for p in policy.actor_parameters() if p.requires_grad]
 
-    def update(self, progress: float) -> Mapping[str, float]:
+    @staticmethod
+    def build_policy(factory: NetworkFactory, settings: TRPOSettings) -> ActorCritic:
+        """See `Algorithm.build_policy`."""
+        return ActorCritic(factory, settings.network_settings)
+
+    def update(self, run_fraction: float) -> Mapping[str, float]:
         """See `Algorithm.update`."""
-        rollout = self._pop_rollout()
-        schedules = self._set_schedules(progress)
-        statistics = self._improve_policy(rollout, schedules["Policy/Delta"])
+        rollout, hyper = self._pop_rollout(), self._hyperparameters
+        delta = hyper.delta_schedule.value(hyper.delta, run_fraction)
+        rate = hyper.learning_rate_schedule.value(hyper.learning_rate, run_fraction)
+        (critic,) = self._optimizer.param_groups
+        critic["lr"] = rate
+        statistics = self._improve_policy(rollout, delta)
         statistics |= self._fit_critic(rollout)
         self.policy.update_statistics(rollout.vectors)
         variance = explained_variance(rollout.returns, rollout.values)
-        return statistics | schedules | {"Policy/Explained Variance": variance}
-
-    def _set_schedules(self, progress: float) -> dict[str, float]:
-        hyper = self._hyperparameters
-        rate = hyper.learning_rate_schedule.value(hyper.learning_rate, progress)
-        (critic,) = self._optimizer.param_groups
-        critic["lr"] = rate
-        delta = hyper.delta_schedule.value(hyper.delta, progress)
-        return {"Policy/Learning Rate": rate, "Policy/Delta": delta}
+        return statistics | {
+            "Policy/Learning Rate": rate,
+            "Policy/Delta": delta,
+            "Policy/Explained Variance": variance,
+        }
 
     def _improve_policy(self, rollout: Rollout, delta: float) -> dict[str, float]:
         hyper = self._hyperparameters

@@ -2,56 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
-import gymnasium
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from trainers.networks.observations import Observations, gather, is_frame
+from trainers.networks.observations import Observations, gather
 from trainers.networks.recurrent import Sequences
-
-
-class FrameStore:
-    """Frames in the order they came, each once, and moved to the device once.
-
-    The memory is reserved for the most there can be; on the CPU the operating system gives it page
-    by page as frames arrive, so that frames which are shared cost nothing.
-
-    Args:
-        spaces: of the frames, by name.
-        capacity: the most frames there can be.
-        device: where they are kept.
-    """
-
-    def __init__(
-        self,
-        spaces: Mapping[str, gymnasium.Space[Any]],
-        capacity: int,
-        device: torch.device,
-    ):
-        self._tensors = {
-            name: torch.empty((capacity, *(space.shape or ())), dtype=_dtype(space), device=device)
-            for name, space in spaces.items()
-        }
-        self.count = 0
-
-    def add(
-        self, observations: Mapping[str, NDArray[Any]], rows: NDArray[np.int64]
-    ) -> NDArray[np.int64]:
-        """Keeps some rows of the observations; returns the frames' indices."""
-        first, self.count = self.count, self.count + len(rows)
-        for name, tensor in self._tensors.items():
-            tensor[first : self.count].copy_(torch.from_numpy(observations[name][rows]))
-        return np.arange(first, self.count)
-
-    def tensors(self, first: int = 0) -> dict[str, Tensor]:
-        """All frames from the `first` on by name, (count - first, H, W, C), without a copy."""
-        return {name: tensor[first : self.count] for name, tensor in self._tensors.items()}
 
 
 @dataclass(frozen=True)
@@ -64,7 +22,7 @@ class Rollout:
         vectors: by name, (M, n).
         shuffle_groups: the number, from 0, of the group that each belongs to, which stays
             together: the transitions of one frame or, of a policy with memory, of one sequence.
-        states: (M, m) what the policy remembered before each; m is 0 without memory.
+        hidden_states: (M, m) of the policy before each; m is 0 without memory.
         actions: as the policy drew them, before any clipping.
         log_probs: of the actions under the policy that drew them.
         values: under the critic of that time.
@@ -76,7 +34,7 @@ class Rollout:
     frame_index: Tensor
     vectors: dict[str, Tensor]
     shuffle_groups: Tensor
-    states: Tensor
+    hidden_states: Tensor
     actions: Tensor
     log_probs: Tensor
     values: Tensor
@@ -98,11 +56,11 @@ class Rollout:
 
     def _sequences_of(self, rows: Tensor) -> Sequences | None:
         """The sequences that some rows make up; None where nothing is remembered."""
-        if not self.states.shape[1]:
+        if not self.hidden_states.shape[1]:
             return None
         _, lengths = self.shuffle_groups[rows].unique_consecutive(return_counts=True)
         first = rows[lengths.cumsum(0) - lengths]
-        return Sequences(lengths.cpu(), self.states[first])
+        return Sequences(lengths.cpu(), self.hidden_states[first])
 
     def _frames_of(self, rows: Tensor) -> tuple[dict[str, Tensor], Tensor | None]:
         """The frames of some rows; where rows share them each once, and which is whose."""
@@ -130,13 +88,3 @@ class Rollout:
         place = torch.randperm(count, generator=generator, device=device)
         order = torch.argsort(place[self.shuffle_groups], stable=True)
         yield from order.split(size)
-
-
-def frame_spaces(space: gymnasium.spaces.Dict) -> dict[str, gymnasium.Space[Any]]:
-    """The spaces of the images among the observations."""
-    return {name: part for name, part in space.spaces.items() if is_frame(part)}
-
-
-def _dtype(space: gymnasium.Space[Any]) -> torch.dtype:
-    """Torch's name of the type of a space's numbers."""
-    return torch.from_numpy(np.empty(0, space.dtype)).dtype

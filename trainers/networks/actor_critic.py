@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Literal
 
 import gymnasium
-import numpy as np
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
@@ -16,8 +15,10 @@ from torch import Tensor, nn
 from trainers.common.errors import UserError
 from trainers.networks.distributions import Categorical, DiagonalGaussian, Distribution
 from trainers.networks.factory import NetworkFactory
+from trainers.networks.frame_features import FrameFeatures
 from trainers.networks.network import NetworkSettings, head
 from trainers.networks.observations import Observations
+from trainers.networks.policy_network import PolicyNetwork
 from trainers.networks.recurrent import MemorySettings
 
 ACTOR_GAIN = 0.01  # a small last layer: at first every observation gets nearly the same action
@@ -64,7 +65,7 @@ class PolicySettings(ActorCriticSettings, frozen=True, extra="forbid"):
         return self
 
 
-class ActorCritic(nn.Module):
+class ActorCritic(PolicyNetwork):
     """A policy and a value function.
 
     Args:
@@ -72,7 +73,6 @@ class ActorCritic(nn.Module):
         settings: what they look like.
 
     Attributes:
-        state_size: numbers that the actor and a separate critic remember; 0 without memory.
         sequence_length: steps through which gradients flow back; 1 without memory.
 
     Raises:
@@ -82,6 +82,7 @@ class ActorCritic(nn.Module):
     def __init__(self, factory: NetworkFactory, settings: PolicySettings):
         super().__init__()
         actor, critic = observed(factory, settings)
+        self.sees = actor
         self.actor = factory.network(settings, actor, settings.memory)
         self.critic = (
             factory.network(settings, critic, settings.memory)
@@ -114,10 +115,6 @@ class ActorCritic(nn.Module):
             width if self.critic is None else self.critic.features_dim, 1, CRITIC_GAIN
         )
 
-    def initial_state(self, count: int) -> Tensor:
-        """What is remembered where episodes begin, (count, state_size)."""
-        return self.value_head.weight.new_zeros(count, self.state_size)
-
     def forward(
         self, observations: Observations, features: FrameFeatures | None = None
     ) -> tuple[Distribution, Tensor]:
@@ -129,7 +126,7 @@ class ActorCritic(nn.Module):
         self, observations: Observations, features: FrameFeatures | None = None
     ) -> tuple[Distribution, Tensor, Tensor]:
         """The distribution of actions, the values (B,), and the state (S, state_size) after."""
-        known = features or FrameFeatures(None, None)
+        known = features or FrameFeatures()
         seen_by_actor, seen_by_critic = self._split(observations)
         hidden, state = self.actor.forward_recurrent(seen_by_actor, known.actor)
         distribution, critic_hidden = self._distribution(hidden), hidden
@@ -146,16 +143,27 @@ class ActorCritic(nn.Module):
 
     def value(self, observations: Observations, features: FrameFeatures | None = None) -> Tensor:
         """The values (B,) alone."""
-        known = features or FrameFeatures(None, None)
+        known = features or FrameFeatures()
         seen_by_actor, seen_by_critic = self._split(observations)
         if self.critic is None:
             return self._value(self.actor(seen_by_actor, known.actor))
         return self._value(self.critic(seen_by_critic, known.critic))
 
-    def encode_frames(self, observations: Observations) -> FrameFeatures:
-        """What the encoders say of frames, to be reused as long as neither changes."""
-        critic = None if self.critic is None else self.critic.encode_frames(observations.frames)
-        return FrameFeatures(self.actor.encode_frames(observations.frames), critic)
+    def act(
+        self, observations: Observations, *, deterministic: bool, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """See `PolicyNetwork.act`."""
+        hidden, state = self.actor.forward_recurrent(self._split(observations)[0])
+        distribution = self._distribution(hidden)
+        actions = distribution.mode() if deterministic else distribution.sample(generator)
+        # What a critic remembers is of no use here, and stays as it was at the beginning.
+        of_critic = self.state_size - self.actor.state_size
+        return actions, torch.cat([state, state.new_zeros(len(state), of_critic)], dim=1)
+
+    def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
+        """Features of U frames by name, (U, H, W, C)."""
+        critic = None if self.critic is None else self.critic.encode_frames(frames)
+        return FrameFeatures(self.actor.encode_frames(frames), critic)
 
     def update_statistics(self, vectors: dict[str, Tensor]) -> None:
         """Shows vector observations to the encoders that standardise."""
@@ -198,31 +206,6 @@ class ActorCritic(nn.Module):
         )
 
 
-class FrameFeatures:
-    """Features (B, f) of B frames, as the actor's and the critic's encoders gave them."""
-
-    def __init__(self, actor: Tensor | None, critic: Tensor | None):
-        self.actor, self.critic = actor, critic
-
-    def rows(self, rows: Tensor) -> FrameFeatures:
-        """Those of some rows."""
-        actor, critic = (None if f is None else f[rows] for f in (self.actor, self.critic))
-        return FrameFeatures(actor, critic)
-
-    def with_rows(self, rows: Tensor, other: FrameFeatures) -> FrameFeatures:
-        """These, with other features at some rows."""
-        return FrameFeatures(
-            with_rows(self.actor, rows, other.actor), with_rows(self.critic, rows, other.critic)
-        )
-
-
-def with_rows(features: Tensor | None, rows: Tensor, other: Tensor | None) -> Tensor | None:
-    """Features (B, f) with others in place of some rows; None where there are none."""
-    if features is None or other is None:
-        return None
-    return features.index_copy(0, rows, other)
-
-
 def observed(
     factory: NetworkFactory, settings: ActorCriticSettings
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -240,11 +223,3 @@ def observed(
         for name in names:
             factory.check_name(name, f"{NETWORK_PATH}.{path}")
     return actor, critic
-
-
-def to_environment(actions: Tensor, space: gymnasium.Space) -> np.ndarray:
-    """Actions as the environment takes them: within the bounds of a Box."""
-    values = actions.cpu().numpy()
-    if isinstance(space, gymnasium.spaces.Box):
-        return np.clip(values, space.low, space.high)
-    return values

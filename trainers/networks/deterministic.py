@@ -5,18 +5,18 @@ from __future__ import annotations
 import copy
 from typing import Annotated, Any, Literal
 
-import gymnasium
-import numpy as np
 import torch
 from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from trainers.common.errors import UserError
+from trainers.networks.actions import ActionScaling
 from trainers.networks.actor_critic import ACTOR_GAIN, CRITIC_GAIN, ActorCriticSettings, observed
 from trainers.networks.factory import NetworkFactory
+from trainers.networks.frame_features import FrameFeatures
 from trainers.networks.network import Network, NetworkSettings, head, hidden_layers
 from trainers.networks.observations import Observations
+from trainers.networks.policy_network import PolicyNetwork
 
 ENCODERS_ALONE = {"num_layers": 0}
 
@@ -71,7 +71,7 @@ class DeterministicActorCritic(nn.Module):
         self.actor_encoder: Network | None = None
         if settings.critic == "separate":
             self.actor_encoder = factory.network(encoders_alone, self.actor_sees)
-        size = bounded(factory.action_space).shape[0]
+        size = ActionScaling(factory.action_space).size
         actor_inputs = self._acting_encoder.features_dim
         self.actor = nn.Sequential(*_layers(actor_inputs, size, ACTOR_GAIN, settings), nn.Tanh())
         critic_inputs = self.critic_encoder.features_dim + size
@@ -85,9 +85,9 @@ class DeterministicActorCritic(nn.Module):
         actions: Tensor = self.actor(features)
         return actions
 
-    def encode_frames(self, frames: dict[str, Tensor]) -> Tensor | None:
-        """What the actor makes of frames alone, (U, f); None without cameras."""
-        return self._acting_encoder.encode_frames(frames)
+    def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
+        """The actor's features of U frames by name, (U, H, W, C)."""
+        return FrameFeatures(self._acting_encoder.encode_frames(frames))
 
     @property
     def _acting_encoder(self) -> Network:
@@ -110,35 +110,50 @@ class DeterministicActorCritic(nn.Module):
         return [*self.critic_encoder.parameters(), *self.critic.parameters()]
 
 
-class DeterministicPolicy(nn.Module):
+class DeterministicPolicy(PolicyNetwork):
     """The networks that learn, and their targets.
 
     Args:
         factory: builds the encoders.
         settings: what the networks look like.
         tau: how far the targets follow at a time.
+        final_sigma: standard deviation of the exploration noise at the end of training.
 
     Attributes:
         online: what learns.
         target: what follows it.
+        scale: actions in [-1, 1] to the bounds of the environment's.
     """
 
-    _low: Tensor
-    _high: Tensor
-
-    def __init__(self, factory: NetworkFactory, settings: DeterministicSettings, tau: float):
+    def __init__(
+        self,
+        factory: NetworkFactory,
+        settings: DeterministicSettings,
+        tau: float,
+        final_sigma: float = 0.0,
+    ):
         super().__init__()
         self.online = DeterministicActorCritic(factory, settings)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
-        space = bounded(factory.action_space)
-        self.register_buffer("_low", torch.as_tensor(space.low), persistent=False)
-        self.register_buffer("_high", torch.as_tensor(space.high), persistent=False)
+        self.sees = self.online.actor_sees
+        self.scale = ActionScaling(factory.action_space)
+        self._final_sigma = final_sigma
         self._average = get_ema_multi_avg_fn(1.0 - tau)
         self._pairs = list(self.target.parameters()), list(self.online.parameters())
 
-    def to_space(self, actions: Tensor) -> Tensor:
-        """Actions in [-1, 1] as the environment's space has them."""
-        return self._low + (actions + 1.0) / 2.0 * (self._high - self._low)
+    def act(
+        self, observations: Observations, *, deterministic: bool, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """See `PolicyNetwork.act`; what is drawn has the noise of the run's end.
+
+        No action is replaced by one of `random_actions`: those are drawn for the buffer's sake and
+        say nothing of the policy.
+        """
+        actions = self.online.act(observations)
+        if not deterministic:
+            noise = torch.randn(actions.shape, generator=generator, device=actions.device)
+            actions = (actions + self._final_sigma * noise).clamp(-1.0, 1.0)
+        return self.scale(actions), self.initial_state(len(actions))
 
     def update_targets(self) -> None:
         """Moves the targets towards what learns: target += tau (online - target)."""
@@ -151,21 +166,6 @@ class DeterministicPolicy(nn.Module):
             self.online.actor_encoder.update_statistics(vectors)
         for theirs, ours in zip(self.target.buffers(), self.online.buffers(), strict=True):
             theirs.copy_(ours)
-
-
-def bounded(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:
-    """A space of actions that can be scaled to [-1, 1].
-
-    Raises:
-        UserError: it is not one.
-    """
-    match space:
-        case gymnasium.spaces.Box(shape=(_,)) if np.isfinite([space.low, space.high]).all():
-            return space
-    raise UserError(
-        f"trainer: a deterministic policy needs continuous actions within bounds (a Box of one "
-        f"dimension), and this environment's are {space}; use trainer_type: ppo"
-    )
 
 
 def _layers(inputs: int, outputs: int, gain: float, settings: NetworkSettings) -> list[nn.Module]:

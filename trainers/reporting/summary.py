@@ -11,7 +11,7 @@ import numpy as np
 
 from trainers.common.averager import Averager
 from trainers.experience.env_runner import SUCCESS, EpisodeBatch
-from trainers.experience.rollout import frame_spaces
+from trainers.experience.frames import frame_spaces
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.images import picture
 from trainers.reporting.terminal import RunStatus, TerminalDisplay

@@ -20,6 +20,7 @@ from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner, NonFiniteError, concatenate
 from trainers.networks.deterministic import DeterministicPolicy, DeterministicSettings
 from trainers.networks.factory import NetworkFactory
+from trainers.networks.frame_features import FrameFeatures
 from trainers.networks.observations import Observations, to_tensors
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings
@@ -180,7 +181,7 @@ def test_actions_are_scaled_to_the_space(make_factory: Callable[..., NetworkFact
     space = Box(np.array([-2.0, 0.0], np.float32), np.array([4.0, 0.5], np.float32))
     factory = make_factory(LINE.spaces, action_space=space)
     policy = DeterministicPolicy(factory, DeterministicSettings(hidden_units=3), tau=0.1)
-    scaled = policy.to_space(torch.tensor([[-1.0, -1.0], [0.0, 0.0], [1.0, 0.5]]))
+    scaled = policy.scale(torch.tensor([[-1.0, -1.0], [0.0, 0.0], [1.0, 0.5]]))
     assert scaled.tolist() == [[-2.0, 0.0], [1.0, 0.25], [4.0, 0.375]]
 
 
@@ -345,6 +346,14 @@ def test_noise_and_random_actions_explore(make_ddpg: MakeDDPG) -> None:
     assert explored(noise={"type": "gaussian", "sigma": 9.0}).abs().max() == 1.0
 
 
+def acted(
+    algorithm: DDPG, observations: Observations, *, deterministic: bool
+) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        return algorithm.policy.act(observations, deterministic=deterministic, generator=generator)
+
+
 def test_noise_falls_along_its_schedule(make_ddpg: MakeDDPG) -> None:
     noise = {"type": "gaussian", "sigma": 0.4, "schedule": "linear"}
     algorithm = make_ddpg("target", {"noise": noise, "buffer_init_steps": 0})
@@ -353,20 +362,20 @@ def test_noise_falls_along_its_schedule(make_ddpg: MakeDDPG) -> None:
             parameter.zero_()
     observations = Observations({}, {"goal": torch.zeros(5_000, 2)})
     assert one_round(algorithm, 0.25)["Policy/Noise"] == pytest.approx(0.3)
-    assert algorithm._sigma(0.5) == pytest.approx(0.2)
+    assert algorithm._hyperparameters.sigma(0.5) == pytest.approx(0.2)
     # Evaluation draws with the noise of the run's end, of which nothing is left here.
-    drawn, remembered = algorithm.act(observations, deterministic=False)
-    assert torch.equal(drawn, algorithm.act(observations, deterministic=True)[0])
-    assert remembered.shape == algorithm.initial_state(5_000).shape == (5_000, 0)
+    drawn, hidden_state = acted(algorithm, observations, deterministic=False)
+    assert torch.equal(drawn, acted(algorithm, observations, deterministic=True)[0])
+    assert hidden_state.shape == algorithm.policy.initial_state(5_000).shape == (5_000, 0)
 
 
 def test_evaluation_draws_with_noise_only_where_it_is_asked_to(make_ddpg: MakeDDPG) -> None:
     noise = {"type": "gaussian", "sigma": 0.2}
     algorithm = make_ddpg("target", {"noise": noise, "random_actions": 0.5})
     observations = Observations({}, {"goal": torch.zeros(5_000, 2)})
-    best, _ = algorithm.act(observations, deterministic=True)
-    assert torch.equal(best, algorithm.act(observations, deterministic=True)[0])
-    drawn, _ = algorithm.act(observations, deterministic=False)
+    best, _ = acted(algorithm, observations, deterministic=True)
+    assert torch.equal(best, acted(algorithm, observations, deterministic=True)[0])
+    drawn, _ = acted(algorithm, observations, deterministic=False)
     assert (drawn - best).std() == pytest.approx(0.2, abs=0.01)
     assert drawn.abs().max() <= 1.0
 
@@ -377,8 +386,8 @@ def test_learning_rates_follow_their_schedule(make_ddpg: MakeDDPG) -> None:
     statistics = one_round(algorithm, 0.75)
     assert statistics["Policy/Learning Rate"] == pytest.approx(1e-3)
     assert statistics["Policy/Critic Learning Rate"] == pytest.approx(2e-3)
-    assert algorithm._actor_optimizer.param_groups[0]["lr"] == pytest.approx(1e-3)
-    assert algorithm._critic_optimizer.param_groups[0]["lr"] == pytest.approx(2e-3)
+    assert algorithm._optimizers["actor"].param_groups[0]["lr"] == pytest.approx(1e-3)
+    assert algorithm._optimizers["critic"].param_groups[0]["lr"] == pytest.approx(2e-3)
 
 
 # -- one round -----------------------------------------------------------------------------------
@@ -440,20 +449,20 @@ def test_a_frame_is_encoded_once_as_long_as_it_is_in_view(
     online, encoded = algorithm.policy.online, []
     encode = online.encode_frames
 
-    def counting(frames: dict[str, Tensor]) -> Tensor | None:
+    def counting(frames: dict[str, Tensor]) -> FrameFeatures:
         encoded.append(len(frames["camera"]))
         return encode(frames)
 
     monkeypatch.setattr(online, "encode_frames", counting)
     algorithm.collect()
-    moments = algorithm._moments
-    ended = [int(moment.step.done.sum()) for moment in moments[:-1]]
+    collected = algorithm._collected
+    ended = [int(step.step.done.sum()) for step in collected[:-1]]
     assert sum(ended) > 0
-    assert encoded == [len(moments[0].actions), *filter(None, ended)]
+    assert encoded == [len(collected[0].acted.actions), *filter(None, ended)]
     space = algorithm._env_runner.env.single_observation_space
-    for moment in moments:
-        seen = to_tensors(moment.observations, space, torch.device("cpu"))
-        torch.testing.assert_close(torch.from_numpy(moment.actions), online.act(seen))
+    for step in collected:
+        seen = to_tensors(step.observations, space, torch.device("cpu"))
+        torch.testing.assert_close(step.acted.output, online.act(seen))
 
 
 def test_a_collection_leaves_the_state_before_it_as_it_was(make_ddpg: MakeDDPG) -> None:

@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from encoders.spaces import DepthImage, RgbImage
-from trainers.experience.rollout import FrameStore, Rollout
+from trainers.experience.frames import FrameStore
+from trainers.experience.rollout import Rollout
 
 SIDE_PX = 2
 CPU = torch.device("cpu")
@@ -31,7 +32,7 @@ def rollout_of(
         frame_index=frame_index,
         vectors={"number": numbers[:, None]},
         shuffle_groups=frame_index if shuffle_groups is None else shuffle_groups,
-        states=numbers[:, None],
+        hidden_states=numbers[:, None],
         actions=numbers,
         log_probs=numbers,
         values=numbers,

@@ -18,14 +18,11 @@ from torch import nn
 from encoders.conv import Conv
 from encoders.spaces import RgbImage
 from trainers.common.errors import UserError
-from trainers.networks.actor_critic import (
-    ActorCritic,
-    FrameFeatures,
-    PolicySettings,
-    to_environment,
-)
+from trainers.networks.actions import to_environment
+from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Categorical, DiagonalGaussian
 from trainers.networks.factory import NetworkFactory
+from trainers.networks.frame_features import FrameFeatures
 from trainers.networks.observations import Observations
 from trainers.networks.recurrent import Sequences
 from trainers.runfile.settings import Component
@@ -135,7 +132,7 @@ def test_values_alone_actions_alone_and_both_agree(
     distribution, values = policy(observations)
     assert torch.equal(policy.value(observations), values)
     assert torch.equal(policy.distribution(observations).mean, distribution.mean)
-    known = policy.encode_frames(observations)
+    known = policy.encode_frames(observations.frames)
     rows = observations.frame_index
     assert known.actor is not None
     cached = FrameFeatures(known.actor[rows], None if known.critic is None else known.critic[rows])

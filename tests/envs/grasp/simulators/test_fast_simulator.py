@@ -419,7 +419,7 @@ def test_a_team_does_every_row_once(threads: int, rows: int) -> None:
         assert 0 <= begin <= end <= rows
         done[begin:end] += 1
 
-    team.share(work, rows)
+    team.parallel_for(work, rows)
     team.close()
     team.close()
     np.testing.assert_array_equal(done, 1)
@@ -427,7 +427,7 @@ def test_a_team_does_every_row_once(threads: int, rows: int) -> None:
 
 def test_a_teams_members_work_at_the_same_time_and_their_errors_are_passed_on() -> None:
     team, meeting = ThreadPool(2), threading.Barrier(2, timeout=10.0)
-    team.share(lambda begin, end: print(meeting.wait()), 16)  # two parts: nobody works alone
+    team.parallel_for(lambda begin, end: print(meeting.wait()), 16)  # two parts: nobody works alone
 
     def fail(begin: int, end: int) -> None:
         meeting.wait()
@@ -435,7 +435,7 @@ def test_a_teams_members_work_at_the_same_time_and_their_errors_are_passed_on() 
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        team.share(fail, 16)
+        team.parallel_for(fail, 16)
     team.close()
 
 

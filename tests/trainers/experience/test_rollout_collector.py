@@ -14,10 +14,10 @@ from pydantic import BaseModel
 from torch import Tensor, nn
 
 from encoders.spaces import DepthImage
-from trainers.experience.collector import OnPolicyCollector
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.reward_normalizer import RewardNormalizer
 from trainers.experience.rollout import Rollout
+from trainers.experience.rollout_collector import RolloutCollector
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import Observations
@@ -51,7 +51,7 @@ class Probe(nn.Module):
 
 def collector_on(
     env: Any, make_factory: MakeFactory, steps: int, **settings: Any
-) -> tuple[OnPolicyCollector, ActorCritic]:
+) -> tuple[RolloutCollector, ActorCritic]:
     torch.manual_seed(0)
     probe = {"depth": Component("probe", Probe, Probe.Settings())}
     space = env.single_observation_space.spaces
@@ -61,7 +61,7 @@ def collector_on(
     env_runner = EnvRunner(env)
     env_runner.reset()
     generator = torch.Generator().manual_seed(0)
-    return OnPolicyCollector(policy, env_runner, steps, generator, CPU), policy
+    return RolloutCollector(policy, env_runner, steps, generator, CPU), policy
 
 
 def value_is(policy: ActorCritic, slope: float, intercept: float) -> None:
@@ -117,11 +117,11 @@ def test_normalized_rewards_are_for_the_learner_alone(
     env_runner.reset()
     normalizer = RewardNormalizer(1, gamma=0.0)
     generator = torch.Generator().manual_seed(0)
-    collector = OnPolicyCollector(policy, env_runner, 2, generator, CPU, normalizer)
+    collector = RolloutCollector(policy, env_runner, 2, generator, CPU, normalizer)
     rollout = collector.collect(gamma=0.0, lambd=0.0)
     assert rollout.returns.tolist() == pytest.approx([1.0, 3.0])  # the deviation of 2 and 6 is 2
     assert env_runner.pop_finished().rewards.tolist() == [8.0]
-    other = OnPolicyCollector(policy, env_runner, 2, generator, CPU, RewardNormalizer(1, 0.0))
+    other = RolloutCollector(policy, env_runner, 2, generator, CPU, RewardNormalizer(1, 0.0))
     other.load_state_dict(collector.state_dict())
     normalizers = [c.state_dict()["reward_normalizer"] for c in (other, collector)]
     assert normalizers[0] == normalizers[1]
@@ -341,7 +341,7 @@ def test_memory_begins_with_an_episode_and_goes_on_through_collections(
         state = torch.zeros(1, policy.state_size)
         for t in range(STEPS):
             rollout, row = rollouts[t // 7], (t % 7) * COUNT + number
-            assert_near(rollout.states[row], state[0])
+            assert_near(rollout.hidden_states[row], state[0])
             observation = seen(env.script["x"][t, number], state)
             with torch.no_grad():
                 _, value, state = policy.step(observation)
@@ -356,8 +356,8 @@ def test_memory_begins_with_an_episode_and_goes_on_through_collections(
             assert_near(rollout.advantages[row], delta.float())
             if env.terminated[t, number] or env.truncated[t, number]:
                 state = torch.zeros_like(state)
-    assert (rollouts[1].states[0] == 0).all()  # its episode was cut off at the very end
-    assert (rollouts[1].states[2] != 0).all()
+    assert (rollouts[1].hidden_states[0] == 0).all()  # its episode was cut off at the very end
+    assert (rollouts[1].hidden_states[2] != 0).all()
 
 
 def seen(x: np.ndarray, state: Tensor) -> Observations:
@@ -388,6 +388,6 @@ def test_without_memory_there_is_nothing_to_remember(
 ) -> None:
     collector, policy = collector_on(camera_script(scripted), make_factory, 5)
     rollout = collector.collect(0.9, 0.9)
-    assert rollout.states.shape == (15, 0)
+    assert rollout.hidden_states.shape == (15, 0)
     assert torch.equal(rollout.shuffle_groups, rollout.frame_index)
     assert policy.initial_state(3).shape == (3, 0)

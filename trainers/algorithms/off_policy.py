@@ -1,0 +1,252 @@
+"""What algorithms share that learn from a replay buffer, as DDPG does."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field, model_validator
+from torch import Tensor, nn
+
+from trainers.algorithms.augmentation import RandomShift, unchanged
+from trainers.algorithms.base import TrainerSettings
+from trainers.algorithms.optimization import optimizer_step
+from trainers.algorithms.schedules import CONSTANT, Schedule
+from trainers.common.averager import Averager
+from trainers.experience.collector import Acted, CollectedStep, Collector
+from trainers.experience.env_runner import EnvRunner
+from trainers.experience.replay_buffer import ReplayBuffer
+from trainers.networks.actions import ActionScaling
+from trainers.networks.frame_features import FrameFeatures
+from trainers.networks.observations import Observations
+from trainers.networks.policy_network import PolicyNetwork
+
+
+class OffPolicyHyperparameters(BaseModel, frozen=True, extra="forbid"):
+    """Hyper-parameters of the replay buffer, and of the updates from it."""
+
+    batch_size: int = Field(256, ge=1, description="Transitions in one optimizer step.")
+    buffer_size: int = Field(200_000, ge=1, description="Transitions in the replay buffer.")
+    buffer_init_steps: int = Field(
+        1_000,
+        ge=0,
+        description="Transitions, of actions drawn uniformly, before the first update.",
+    )
+    updates_per_step: float = Field(
+        1.0,
+        gt=0.0,
+        description="Updates per transition; with many environments a fraction of 1 is enough.",
+    )
+    policy_delay: int = Field(
+        1, ge=1, description="Updates of the critic for each one of the actor and of the targets."
+    )
+    learning_rate: float = Field(1e-3, gt=0.0, description="Of the actor, to begin with.")
+    critic_learning_rate: float | None = Field(
+        None, gt=0.0, description="Of the critic, to begin with; null: the actor's."
+    )
+    learning_rate_schedule: Schedule = Field(CONSTANT, description="Course of both learning rates.")
+    gamma: float = Field(0.99, ge=0.0, le=1.0, description="Discount factor.")
+    tau: float = Field(
+        0.005, gt=0.0, le=1.0, description="How far the target networks follow in an update."
+    )
+    n_step: int = Field(1, ge=1, description="Rewards in a return before the critic takes over.")
+    random_actions: float = Field(
+        0.0, ge=0.0, le=1.0, description="Share of the actions that are drawn uniformly instead."
+    )
+    random_shift_px: int = Field(
+        0, ge=0, description="Images are shifted by up to so many pixels at random; 0: never."
+    )
+    max_gradient_norm: float | None = Field(
+        None, gt=0.0, description="Gradients are clipped to this norm; null: not at all."
+    )
+    save_replay_buffer: bool = Field(
+        False,
+        description="Keep the replay buffer in the checkpoints. Without it a run that is resumed "
+        "collects buffer_init_steps with its policy before it learns on.",
+    )
+
+    @model_validator(mode="after")
+    def _fits_in_the_buffer(self) -> OffPolicyHyperparameters:
+        for name in ("batch_size", "buffer_init_steps"):
+            if getattr(self, name) > self.buffer_size:
+                raise ValueError(
+                    f"{name} {getattr(self, name)} is over buffer_size {self.buffer_size}: lower "
+                    f"{name}, or raise buffer_size"
+                )
+        return self
+
+    def learning_rates(self, run_fraction: float) -> tuple[float, float]:
+        """Those of the actor and of the critic at a point of the run."""
+        schedule = self.learning_rate_schedule
+        return (
+            schedule.value(self.learning_rate, run_fraction),
+            schedule.value(self.critic_learning_rate or self.learning_rate, run_fraction),
+        )
+
+
+class OffPolicySettings(TrainerSettings, frozen=True, extra="forbid"):
+    """The `trainer` section of a run with an off-policy algorithm."""
+
+    time_horizon: int = Field(
+        64, ge=1, description="Steps of each environment between two rounds of updates."
+    )
+
+
+class OffPolicyAlgorithm:
+    """Collects transitions into a replay buffer, and updates from it. Implements `Algorithm`.
+
+    A subclass says how to explore, and what an update is.
+
+    What is collected waits beside the buffer until the update: the buffer, like the weights, stays
+    as it is while the run can still be asked to stop, and its state needs no copy.
+
+    Args:
+        policy: on the device.
+        settings: how long to collect.
+        hyperparameters: what all algorithms of this kind have.
+        scale: actions in [-1, 1] to the bounds of the environment's.
+        optimizers: by name, as checkpoints have them.
+        seen: names of the observations that updates look at.
+        env_runner: the environments.
+        generator: the source of all randomness.
+        device: where the policy lives.
+    """
+
+    policy: PolicyNetwork
+    state_size = 0
+
+    def __init__(
+        self,
+        policy: PolicyNetwork,
+        settings: OffPolicySettings,
+        hyperparameters: OffPolicyHyperparameters,
+        scale: ActionScaling,
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        seen: Collection[str],
+        env_runner: EnvRunner,
+        generator: torch.Generator,
+        device: torch.device,
+    ):
+        hyper, env, self.policy = hyperparameters, env_runner.env, policy
+        self._time_horizon, self._max_steps = settings.time_horizon, settings.max_steps
+        self._replay, self._scale, self._optimizers = hyper, scale, optimizers
+        self._env_runner, self._generator, self._device = env_runner, generator, device
+        self._seen = seen
+        self._shape = (env.num_envs, scale.size)
+        self._max_gradient_norm = hyper.max_gradient_norm or float("inf")
+        self._buffer = ReplayBuffer(
+            env.single_observation_space, scale.size, env.num_envs, hyper.buffer_size, device
+        )
+        self._augment = (
+            RandomShift(hyper.random_shift_px, generator) if hyper.random_shift_px else unchanged
+        )
+        self._collector: Collector[Tensor] = Collector(self, env_runner, device)
+        self._collected: list[CollectedStep[Tensor]] = []
+        self._pending_updates = 0.0  # asked for by transitions, and not made yet
+
+    # -- the subclass's --------------------------------------------------------------------------
+
+    @abstractmethod
+    def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
+        """See `collector.Behavior.encode_frames`."""
+
+    @abstractmethod
+    def _explore(self, observations: Observations, features: FrameFeatures) -> Tensor:
+        """Actions (N, A) in [-1, 1], with what the algorithm explores by."""
+
+    @abstractmethod
+    def _begin_updates(self, run_fraction: float) -> dict[str, float]:
+        """Sets what is scheduled; returns it by TensorBoard tag."""
+
+    @abstractmethod
+    def _update_once(self) -> dict[str, float]:
+        """`policy_delay` updates of the critic and one of the actor; statistics by tag."""
+
+    # -- collecting ------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def collect(self) -> None:
+        """See `Algorithm.collect`."""
+        self._collected = []
+        self._collector.begin()
+        for _ in range(self._time_horizon):
+            # No frame is kept here: the buffer has each once.
+            step = self._collector.collect_step(self._collector.frame_store(1))
+            self._collected.append(step)
+            self._episodes_ended(step.step.done)
+
+    def act(self, observations: Observations, features: FrameFeatures) -> Acted[Tensor]:
+        """See `collector.Behavior.act`; the output is the actions (N, A) in [-1, 1]."""
+        hyper, hidden_state = self._replay, self._collector.hidden_state
+        uniform = 2.0 * self._rand(self._shape) - 1.0
+        if self._env_runner.step_count < hyper.buffer_init_steps:
+            return Acted(self._scale(uniform), hidden_state, uniform)
+        explored = self._explore(observations, features)
+        drawn = self._rand((self._shape[0], 1)) < hyper.random_actions
+        actions = torch.where(drawn, uniform, explored)
+        return Acted(self._scale(actions), hidden_state, actions)
+
+    def _episodes_ended(self, done: NDArray[Any]) -> None:
+        """Called after every step with (N,), for exploration that remembers."""
+
+    def _rand(self, shape: tuple[int, int]) -> Tensor:
+        return torch.rand(shape, generator=self._generator, device=self._device)
+
+    # -- learning --------------------------------------------------------------------------------
+
+    def update(self, run_fraction: float) -> Mapping[str, float]:
+        """See `Algorithm.update`."""
+        collected, self._collected = self._collected, []
+        if not collected:
+            raise RuntimeError("update() comes after collect()")
+        scheduled = self._begin_updates(run_fraction)
+        self._remember(collected)
+        averager, hyper = Averager(), self._replay
+        if len(self._buffer) >= hyper.buffer_init_steps:
+            self._pending_updates += len(collected) * self._shape[0] * hyper.updates_per_step
+        while self._pending_updates >= hyper.policy_delay:
+            self._pending_updates -= hyper.policy_delay
+            averager.add(self._update_once())
+        return averager.pop_means() | scheduled
+
+    def _remember(self, collected: Sequence[CollectedStep[Tensor]]) -> None:
+        """Adds what was collected to the buffer and to the statistics of the observations."""
+        for step in collected:
+            actions = step.acted.output.cpu().numpy()
+            self._buffer.add(step.observations, actions, step.step, step.next_observations)
+        vectors = [step.vectors for step in collected]
+        self.policy.update_statistics({k: torch.cat([v[k] for v in vectors]) for k in vectors[0]})
+
+    def _optimizer_step(self, name: str, loss: Tensor, parameters: Sequence[nn.Parameter]) -> None:
+        """One step of an optimizer, with clipped gradients.
+
+        Raises:
+            NonFiniteError: the loss or its gradient is NaN or infinite; nothing was changed.
+        """
+        step = self._env_runner.step_count
+        optimizer_step(self._optimizers[name], loss, parameters, self._max_gradient_norm, step)
+
+    # -- the state -------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Algorithm.state_dict`."""
+        saved = self._replay.save_replay_buffer
+        return {
+            **{f"{name}_optimizer": each.state_dict() for name, each in self._optimizers.items()},
+            "generator": self._generator.get_state(),
+            "due": self._pending_updates,
+            "replay_buffer": self._buffer.state_dict() if saved else None,
+        }
+
+    def load_state_dict(self, weights: dict[str, Tensor], state: dict[str, Any]) -> None:
+        """See `Algorithm.load_state_dict`."""
+        if state["replay_buffer"] is not None:
+            self._buffer.load_state_dict(state["replay_buffer"])
+        self.policy.load_state_dict(weights)
+        for name, optimizer in self._optimizers.items():
+            optimizer.load_state_dict(state[f"{name}_optimizer"])
+        self._generator.set_state(state["generator"])
+        self._pending_updates = state["due"]

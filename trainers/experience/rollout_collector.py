@@ -1,0 +1,215 @@
+"""Collecting rollouts with the present policy, for PPO and its like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from trainers.experience.collector import Acted, CollectedStep, Collector
+from trainers.experience.env_runner import EnvRunner
+from trainers.experience.frames import FrameStore
+from trainers.experience.returns import gae
+from trainers.experience.reward_normalizer import RewardNormalizer
+from trainers.experience.rollout import Rollout
+from trainers.networks.actor_critic import ActorCritic
+from trainers.networks.distributions import Distribution
+from trainers.networks.frame_features import FrameFeatures
+from trainers.networks.observations import Observations, frames_differ
+from trainers.networks.recurrent import number_sequences
+
+Judged = tuple[Distribution, Tensor]
+"""The distribution that actions (N, ...) were drawn from, and the values (N,) of observations."""
+
+
+@dataclass(frozen=True)
+class _RolloutStep:
+    """What a rollout keeps of one step of N environments; the frames are in their store.
+
+    Attributes:
+        final_values: (N,) of the last observations of episodes that were cut off; else zero.
+    """
+
+    frame_index: Tensor
+    vectors: dict[str, Tensor]
+    hidden_state: Tensor
+    actions: Tensor
+    distribution: Distribution
+    values: Tensor
+    final_values: Tensor
+    reward: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+
+
+class SampledActions:
+    """Draws actions from the policy's distribution. Implements `collector.Behavior`.
+
+    Args:
+        policy: the actor and the critic.
+        generator: the source of the actions' randomness.
+    """
+
+    def __init__(self, policy: ActorCritic, generator: torch.Generator):
+        self._policy, self._generator = policy, generator
+        self.state_size = policy.state_size
+
+    def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
+        """See `Behavior.encode_frames`."""
+        return self._policy.encode_frames(frames)
+
+    def act(self, observations: Observations, features: FrameFeatures) -> Acted[Judged]:
+        """See `Behavior.act`."""
+        distribution, values, hidden_state = self._policy.step(observations, features)
+        return Acted(distribution.sample(self._generator), hidden_state, (distribution, values))
+
+
+class RolloutCollector:
+    """Collects T steps of each of N environments with a policy that does not change meanwhile.
+
+    Args:
+        policy: draws the actions and values the observations.
+        env_runner: the environments.
+        steps: T.
+        generator: the source of the actions' randomness.
+        device: where the policy lives.
+        reward_normalizer: scales the rewards that are learned from; None: they stay as they are.
+    """
+
+    def __init__(
+        self,
+        policy: ActorCritic,
+        env_runner: EnvRunner,
+        steps: int,
+        generator: torch.Generator,
+        device: torch.device,
+        reward_normalizer: RewardNormalizer | None = None,
+    ):
+        self._policy, self._env_runner, self._steps = policy, env_runner, steps
+        self._device, self._reward_normalizer = device, reward_normalizer
+        self._collector = Collector(SampledActions(policy, generator), env_runner, device)
+
+    @torch.no_grad()
+    def collect(self, gamma: float, lambd: float) -> Rollout:
+        """Collects a rollout, with advantages and returns.
+
+        Raises:
+            NonFiniteError: a reward or an observation is NaN or infinite.
+        """
+        collector = self._collector
+        frames = collector.frame_store(self._steps)
+        collector.begin()
+        steps = [self._collect_step(frames) for _ in range(self._steps)]
+        last = collector.to_tensors(self._env_runner.observations, collector.hidden_state)
+        advantages, returns = self._estimate(steps, self._policy.value(last), gamma, lambd)
+        frame_index = torch.cat([step.frame_index for step in steps])
+        actions = torch.cat([step.actions for step in steps])
+        distributions = [step.distribution for step in steps]
+        distribution = type(distributions[0]).concatenate(distributions)
+        return Rollout(
+            frames=frames.tensors(),
+            frame_index=frame_index,
+            shuffle_groups=self._sequences(steps) if self._policy.state_size else frame_index,
+            hidden_states=torch.cat([step.hidden_state for step in steps]),
+            vectors={
+                name: torch.cat([step.vectors[name] for step in steps]) for name in steps[0].vectors
+            },
+            actions=actions,
+            log_probs=distribution.log_prob(actions),
+            values=torch.cat([step.values for step in steps]),
+            advantages=advantages.flatten(),
+            returns=returns.flatten(),
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on exactly."""
+        normalizer = self._reward_normalizer
+        return {
+            "remembered": self._collector.hidden_state,
+            "reward_normalizer": None if normalizer is None else normalizer.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes back to a state."""
+        self._collector.hidden_state = state["remembered"].to(self._device)
+        if self._reward_normalizer is not None:
+            self._reward_normalizer.load_state_dict(state["reward_normalizer"])
+
+    def _collect_step(self, frames: FrameStore) -> _RolloutStep:
+        """Acts once in every environment."""
+        collected = self._collector.collect_step(frames)
+        distribution, values = collected.acted.output
+        return _RolloutStep(
+            frame_index=collected.frame_index,
+            vectors=collected.vectors,
+            hidden_state=collected.hidden_state,
+            actions=collected.acted.actions,
+            distribution=distribution,
+            values=values,
+            final_values=self._final_values(collected),
+            reward=collected.step.reward,
+            terminated=collected.step.terminated,
+            truncated=collected.step.truncated,
+        )
+
+    def _final_values(self, step: CollectedStep[Judged]) -> Tensor:
+        hidden_state, collector = step.acted.hidden_state, self._collector
+        values = torch.zeros(len(hidden_state), device=self._device)
+        cut, final = np.flatnonzero(step.step.truncated), step.step.final_observations
+        if not len(cut) or final is None:
+            return values
+        # With frame grab an episode's last image is its first, whose features are known.
+        differ = frames_differ(final, step.observations, collector.frame_names, cut)
+        same, other = self._tensor(cut[~differ]), self._tensor(cut[differ])
+        if len(same):
+            vectors = collector.to_tensors(
+                collector.without_frames(final), hidden_state[same], cut[~differ]
+            )
+            values[same] = self._policy.value(vectors, step.features.rows(same))
+        if len(other):
+            last = collector.to_tensors(final, hidden_state[other], cut[differ])
+            values[other] = self._policy.value(last)
+        return values
+
+    def _sequences(self, steps: list[_RolloutStep]) -> Tensor:
+        """Numbers (M,) of the sequences that the transitions belong to."""
+        done = np.stack([step.terminated | step.truncated for step in steps])
+        return self._tensor(number_sequences(done, self._policy.sequence_length).ravel())
+
+    def _tensor(self, array: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(array).to(self._device)
+
+    def _estimate(
+        self,
+        steps: list[_RolloutStep],
+        last_values: Tensor,
+        gamma: float,
+        lambd: float,
+    ) -> tuple[Tensor, Tensor]:
+        """Advantages and returns (T, N)."""
+
+        def stack(name: str, dtype: torch.dtype) -> Tensor:
+            array = np.stack([getattr(step, name) for step in steps])
+            return torch.from_numpy(array).to(self._device, dtype)
+
+        terminated, truncated = stack("terminated", torch.bool), stack("truncated", torch.bool)
+        done = terminated | truncated
+        values = torch.stack([step.values for step in steps])
+        final_values = torch.stack([step.final_values for step in steps])
+        next_values = torch.cat([values[1:], last_values[None]])
+        rewards = stack("reward", values.dtype)
+        if self._reward_normalizer is not None:
+            rewards = self._reward_normalizer(rewards, done)
+        return gae(
+            rewards,
+            values,
+            torch.where(truncated, final_values, next_values),
+            terminated,
+            done,
+            gamma=gamma,
+            lambd=lambd,
+        )

@@ -1,0 +1,45 @@
+"""The contract of a policy: a network that acts, apart from whatever trains it."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import torch
+from torch import Tensor, nn
+
+from trainers.networks.observations import Observations
+
+
+class PolicyNetwork(nn.Module):
+    """A policy, with whatever else is trained and saved beside it, such as critics.
+
+    Attributes:
+        sees: names of the observations that acting needs.
+        state_size: m, the numbers that it remembers from step to step; 0 without memory.
+    """
+
+    sees: tuple[str, ...]
+    state_size: int = 0
+
+    def initial_state(self, count: int) -> Tensor:
+        """Hidden states where episodes begin, (count, m)."""
+        return next(self.parameters()).new_zeros(count, self.state_size)
+
+    @abstractmethod
+    def act(
+        self, observations: Observations, *, deterministic: bool, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Actions for B observations, with the hidden states before them in their `sequences`.
+
+        Args:
+            observations: B of them.
+            deterministic: the policy's best actions; or drawn as at the end of training.
+            generator: the source of what is drawn.
+
+        Returns:
+            Actions (B, ...) in the units of the environment's space, and the hidden states (B, m)
+            after them.
+        """
+
+    def update_statistics(self, vectors: dict[str, Tensor]) -> None:
+        """Shows vector observations (B, n) by name to the encoders that standardise."""
