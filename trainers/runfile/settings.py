@@ -77,6 +77,15 @@ class RunSettings:
     device: str
 
 
+@dataclass(frozen=True)
+class PolicyComponents:
+    """What a policy's networks are made of."""
+
+    encoders: dict[str, Component]
+    """By the name of the observation."""
+    trainer: Component
+
+
 class _RunFile(BaseModel, frozen=True, extra="forbid"):
     """The top of the run file; a section left empty is as good as absent."""
 
@@ -117,6 +126,15 @@ def load_run(path: Path, overrides: Sequence[str], registries: Registries) -> Ru
     for override in overrides:
         document.override(override)
     return _Sections(document, registries).run()
+
+
+def load_policy(path: Path, registries: Registries) -> PolicyComponents:
+    """Read what a run file says of the policy's networks; its other sections are not looked at.
+
+    Raises:
+        SettingsError: with everything that is wrong, where it stands, and what is allowed.
+    """
+    return _Sections(read(path), registries).policy()
 
 
 def resolved(run: RunSettings) -> dict[str, Any]:
@@ -166,12 +184,7 @@ class _Sections:
         # The sections are looked at even where the top is wrong, to tell everything at once.
         found = self.registries
         environment = self.component("environment", found.environments)
-        rewards = self.rewards()
-        encoders = {
-            name: self.section(("encoders", name), section, found.encoders)
-            for name, section in self.mapping("encoders").items()
-            if isinstance(section, dict)
-        }
+        rewards, encoders = self.rewards(), self.encoders()
         curriculum = self.component("curriculum", found.curricula)
         trainer = self.component("trainer", found.trainers, TRAINER_TYPE_KEY)
         if self.problems or top is None or environment is None or trainer is None:
@@ -179,13 +192,28 @@ class _Sections:
         return RunSettings(
             environment=environment,
             rewards=tuple(rewards),
-            encoders={name: encoder for name, encoder in encoders.items() if encoder},
+            encoders=encoders,
             curriculum=curriculum,
             environment_parameters=top.environment_parameters or {},
             trainer=trainer,
             seed=top.seed,
             device=top.device,
         )
+
+    def policy(self) -> PolicyComponents:
+        encoders = self.encoders()
+        trainer = self.component("trainer", self.registries.trainers, TRAINER_TYPE_KEY)
+        if self.problems or trainer is None:
+            raise SettingsError(self.problems)
+        return PolicyComponents(encoders, trainer)
+
+    def encoders(self) -> dict[str, Component]:
+        found = {
+            name: self.section(("encoders", name), section, self.registries.encoders)
+            for name, section in self.mapping("encoders").items()
+            if isinstance(section, dict)
+        }
+        return {name: encoder for name, encoder in found.items() if encoder}
 
     def mapping(self, key: str) -> dict[str, Any]:
         """Return a section; empty where it is absent or, as was noted at the top, no mapping."""

@@ -1,0 +1,87 @@
+"""Gymnasium's spaces as plain data, for policies that are used without their environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+from numpy.typing import NDArray
+
+from encoders.spaces import DepthImage, RgbImage
+
+Plain = dict[str, Any]
+
+
+def space_to_plain(space: gymnasium.Space[Any]) -> Plain:
+    """A space as JSON can have it; bounds that are all the same become one number.
+
+    Raises:
+        ValueError: it is of another kind than `space_from_plain` knows.
+    """
+    match space:
+        case gymnasium.spaces.Dict():
+            entries = {name: space_to_plain(part) for name, part in space.spaces.items()}
+            return {"type": "dict", "entries": entries}
+        case Discrete():
+            return {"type": "discrete", "n": int(space.n), "start": int(space.start)}
+        case DepthImage():
+            height, width, _ = space.shape
+            return {
+                "type": "depth_image",
+                "height": height,
+                "width": width,
+                "range_m": list(space.range_m),
+                "encoding": space.encoding,
+                "focal_length_px": space.focal_length_px,
+            }
+        case RgbImage():
+            return {"type": "rgb_image", "height": space.shape[0], "width": space.shape[1]}
+        case Box():
+            return {
+                "type": "box",
+                "low": _bound_to_plain(space.low),
+                "high": _bound_to_plain(space.high),
+                "shape": list(space.shape),
+                "dtype": np.dtype(space.dtype).name,
+            }
+    raise ValueError(f"the space {space} can't be written: it is of an unknown kind")
+
+
+def space_from_plain(plain: Plain) -> gymnasium.Space[Any]:
+    """The space that `space_to_plain` wrote.
+
+    Raises:
+        ValueError: the data are of no kind of space.
+        KeyError: something is missing in them.
+    """
+    fields = {key: value for key, value in plain.items() if key != "type"}
+    match plain["type"]:
+        case "dict":
+            # In their own order, which gymnasium would keep for an OrderedDict alone.
+            entries = {name: space_from_plain(part) for name, part in fields["entries"].items()}
+            return gymnasium.spaces.Dict(entries)
+        case "discrete":
+            return Discrete(fields["n"], start=fields["start"])
+        case "depth_image":
+            return DepthImage(**{**fields, "range_m": tuple(fields["range_m"])})
+        case "rgb_image":
+            return RgbImage(**fields)
+        case "box":
+            dtype, shape = np.dtype(fields["dtype"]), tuple(fields["shape"])
+            low, high = (_bound_from_plain(fields[key], dtype, shape) for key in ("low", "high"))
+            return Box(low, high, dtype=dtype.type)
+    raise ValueError(f"a space of the unknown type {plain['type']!r}")
+
+
+def _bound_to_plain(bound: NDArray[Any]) -> Any:
+    """One number or text (`inf`) for all, or a list of them."""
+    values = [value if np.isfinite(value) else str(value) for value in bound.ravel().tolist()]
+    return values[0] if len(set(values)) == 1 else values
+
+
+def _bound_from_plain(plain: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    if isinstance(plain, list):
+        return np.array([float(value) for value in plain]).astype(dtype).reshape(shape)
+    return np.full(shape, float(plain)).astype(dtype)

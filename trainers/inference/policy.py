@@ -1,0 +1,188 @@
+"""A policy by itself: loaded from a folder, asked for actions.
+
+policy = Policy.load("policies/grasp")
+actions, state = policy.predict({"depth": image})
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from envs.environment import Environment
+from trainers.common.errors import UserError
+from trainers.inference.construction import network_factory
+from trainers.inference.inputs import checked
+from trainers.inference.metadata import Metadata, read_metadata
+from trainers.networks.actions import to_environment
+from trainers.networks.observations import to_tensors
+from trainers.networks.policy_network import PolicyNetwork
+from trainers.networks.recurrent import Sequences
+from trainers.runfile.registry import load_registries, plugin_manager
+from trainers.runfile.settings import load_policy, load_run
+from trainers.saving.checkpoint import Loaded
+from trainers.saving.run_folder import CONFIGURATION, find_checkpoint, run_folder
+
+PLUGINS = ("encoders.plugin", "trainers.plugin")
+"""Built-in plugins that a policy is made of; environments and rewards are not loaded."""
+
+
+class Policy:
+    """A network and what goes in and comes out of it.
+
+    Args:
+        network: acts.
+        observation_space: of one environment; every observation by its name.
+        action_space: of one environment.
+        seed: of what `predict` draws when it is not deterministic.
+
+    Attributes:
+        observation_space: the observations that acting needs.
+        action_space: of one environment.
+    """
+
+    def __init__(
+        self,
+        network: PolicyNetwork,
+        observation_space: gymnasium.spaces.Dict,
+        action_space: gymnasium.Space[Any],
+        seed: int = 0,
+    ):
+        self.network, self.action_space = network, action_space
+        self.observation_space = gymnasium.spaces.Dict(
+            {name: observation_space[name] for name in network.sees}
+        )
+        self._ignored = observation_space.spaces.keys() - set(network.sees)
+        self._device = next(network.parameters()).device
+        self._generator = torch.Generator(self._device).manual_seed(seed)
+
+    @classmethod
+    def load(
+        cls,
+        folder_or_run: str | Path,
+        *,
+        results_dir: str | Path = "results",
+        device: str = "cpu",
+        seed: int = 0,
+    ) -> Self:
+        """Loads an exported policy, a run (its best checkpoint) or a checkpoint's folder.
+
+        Args:
+            folder_or_run: a folder, or the id of a run in `results_dir`.
+            results_dir: where runs are kept.
+            device: torch's name of where the network is to be.
+            seed: of what `predict` draws when it is not deterministic.
+
+        Raises:
+            UserError: there is no such policy, it is damaged, a plugin that it needs is not
+                installed here, or its weights don't fit.
+        """
+        loaded = find_checkpoint(str(folder_or_run), Path(results_dir))
+        folder = run_folder(loaded.path)
+        metadata = read_metadata(folder) or _metadata_of_environment(folder)
+        network = _network(loaded, folder, metadata).to(device)
+        return cls(network, metadata.observation_space, metadata.action_space, seed)
+
+    @torch.no_grad()
+    def predict(
+        self,
+        observations: NDArray[Any] | Mapping[str, NDArray[Any]],
+        state: NDArray[np.float32] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], NDArray[np.float32]]:
+        """Chooses actions.
+
+        Args:
+            observations: those of `observation_space` by name, each of one environment or with a
+                leading axis B; where there is only one, its array alone will do. What only a critic
+                sees is left out, or ignored.
+            state: what the last call returned; None where an episode begins, and zeros in the rows
+                of episodes that begin. Only policies with memory look at it.
+            deterministic: the policy's best action; or one drawn as at the end of training.
+
+        Returns:
+            Actions as the environment takes them, and the state (B, m) for the next call; without
+            the leading axis for observations without it.
+
+        Raises:
+            ValueError: observations of the wrong name, shape or type, or a state of the wrong
+                shape; the message names all of them, and what is expected.
+        """
+        batch, is_single = checked(observations, self.observation_space, self._ignored)
+        count = len(next(iter(batch.values())))
+        tensors = to_tensors(batch, self.observation_space, self._device)
+        hidden_state = self._hidden_state(state, count)
+        actions, after = self.network.act(
+            replace(tensors, sequences=Sequences.single(hidden_state)),
+            deterministic=deterministic,
+            generator=self._generator,
+        )
+        chosen, next_state = to_environment(actions, self.action_space), after.cpu().numpy()
+        return (chosen[0], next_state[0]) if is_single else (chosen, next_state)
+
+    def _hidden_state(self, state: NDArray[np.float32] | None, count: int) -> torch.Tensor:
+        """The state (B, m) as a tensor."""
+        if state is None:
+            return self.network.initial_state(count)
+        rows = np.asarray(state, np.float32).reshape(-1, np.shape(state)[-1])
+        if rows.shape != (count, self.network.state_size):
+            raise ValueError(
+                f"state: of shape {np.shape(state)}, where {count} observations need "
+                f"({count}, {self.network.state_size}): what the last call returned"
+            )
+        return torch.from_numpy(rows.copy()).to(self._device)
+
+
+def _metadata_of_environment(folder: Path) -> Metadata:
+    """That of a policy saved before there were metadata: its environment is built to be asked."""
+    registries = load_registries()
+    run = load_run(folder / CONFIGURATION, ["environment.num_envs=1"], registries)
+    env: Environment = run.environment.cls(run.environment.settings, [], 0)
+    with closing(env):
+        return Metadata.of_run(
+            run, registries, env.single_observation_space, env.single_action_space, env.privileged
+        )
+
+
+def _network(loaded: Loaded, folder: Path, metadata: Metadata) -> PolicyNetwork:
+    registries = load_registries(plugin_manager(PLUGINS))
+    metadata.check_plugins(registries, folder)
+    settings = load_policy(folder / CONFIGURATION, registries)
+    factory = network_factory(
+        metadata.observation_space,
+        metadata.action_space,
+        metadata.privileged,
+        settings.encoders,
+        registries.encoders,
+    )
+    network: PolicyNetwork = settings.trainer.cls.build_policy(factory, settings.trainer.settings)
+    load_weights(network, loaded.weights, str(loaded.path))
+    return network
+
+
+def load_weights(network: PolicyNetwork, weights: dict[str, torch.Tensor], where: str) -> None:
+    """Puts saved weights into a network.
+
+    Args:
+        network: changed in place.
+        weights: by name.
+        where: they come from, for the message.
+
+    Raises:
+        UserError: they don't fit; with torch's reason.
+    """
+    try:
+        network.load_state_dict(weights)
+    except RuntimeError as error:
+        reason = " ".join(line.strip() for line in str(error).splitlines()[:3])
+        raise UserError(
+            f"{where}: these weights do not fit the networks of its {CONFIGURATION}: {reason}"
+        ) from error
