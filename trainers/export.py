@@ -9,6 +9,8 @@ from pathlib import Path
 
 from trainers.common.errors import UserError
 from trainers.common.files import write_atomically
+from trainers.inference.metadata import FILE as METADATA
+from trainers.inference.policy import find_metadata
 from trainers.learn import DONE, MISTAKE
 from trainers.saving.checkpoint import MANIFEST, WEIGHTS, weights_manifest
 from trainers.saving.run_folder import CHECKPOINTS, CONFIGURATION, find_checkpoint, run_folder
@@ -22,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as mistake:
         print(f"error: {mistake}", file=sys.stderr)
         return MISTAKE
-    print(f"{options.folder}: {', '.join((WEIGHTS, MANIFEST, CONFIGURATION))}")
+    print(f"{options.folder}: {', '.join((WEIGHTS, MANIFEST, CONFIGURATION, METADATA))}")
     return DONE
 
 
@@ -42,7 +44,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def export(policy: str, folder: Path, results_dir: Path, *, force: bool = False) -> None:
-    """Writes a policy's weights, with their checksum, and its run file; no training state.
+    """Writes a policy's weights, with their checksum, its run file and its spaces.
+
+    Nothing of the training state is among them.
 
     Args:
         policy: a run's folder or id, or a checkpoint's folder.
@@ -54,11 +58,13 @@ def export(policy: str, folder: Path, results_dir: Path, *, force: bool = False)
         UserError: there is no such policy, one is in the folder already, or it can't be written.
     """
     checkpoint = find_checkpoint(policy, results_dir)
+    source = run_folder(checkpoint.path)
     weights = (checkpoint.path / WEIGHTS).read_bytes()
     contents: dict[str, bytes | str] = {
         WEIGHTS: weights,
         MANIFEST: weights_manifest(checkpoint, weights),
-        CONFIGURATION: (run_folder(checkpoint.path) / CONFIGURATION).read_bytes(),
+        CONFIGURATION: (source / CONFIGURATION).read_bytes(),
+        METADATA: find_metadata(source).to_json(),
     }
     if (folder / CHECKPOINTS).is_dir():
         raise UserError(f"{folder}: this is a run: choose another folder")

@@ -13,13 +13,20 @@ from trainers.common.errors import UserError
 from trainers.common.files import write_atomically
 from trainers.common.timers import Timer, recording
 from trainers.experience.env_runner import NonFiniteError
+from trainers.inference.metadata import FILE as METADATA
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.summary import Summary
 from trainers.reporting.terminal import TerminalDisplay, make_display
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import dump_yaml, load_run
 from trainers.saving.checkpoint import Checkpoints, Loaded
-from trainers.saving.run_folder import CHECKPOINTS, begin, check, find_checkpoint
+from trainers.saving.run_folder import (
+    CHECKPOINTS,
+    CONFIGURATION,
+    begin,
+    check,
+    find_checkpoint,
+)
 from trainers.session import Session
 from trainers.training import train
 
@@ -52,7 +59,8 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
     with closing(Session(run, registries, stop_requested)) as session:
         # Nothing is replaced before it is certain that the run can begin.
         resumed = _start(session, options, checkpoints)
-        begin(directory, run, resume=options.resume)
+        files = {CONFIGURATION: dump_yaml(run), METADATA: session.metadata.to_json()}
+        begin(directory, files, resume=options.resume)
         start = session.env_runner.step_count
         with (
             closing(RunLog(directory, start if resumed else None)) as log,

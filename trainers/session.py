@@ -16,6 +16,7 @@ from trainers.algorithms.base import Algorithm
 from trainers.common.errors import UserError, suggestion
 from trainers.experience.env_runner import EnvRunner, EpisodeBatch
 from trainers.inference.construction import network_factory
+from trainers.inference.metadata import Metadata
 from trainers.networks.factory import NetworkFactory
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import Component, RunSettings
@@ -33,6 +34,7 @@ class Session:
         env_runner: the environments.
         algorithm: learns from them.
         curriculum: None where the run has none.
+        metadata: what the run's policies say of themselves.
 
     Raises:
         UserError: the settings don't fit each other.
@@ -56,6 +58,7 @@ class Session:
             torch.manual_seed(run.seed)
             generator = torch.Generator(device).manual_seed(run.seed)
             self.env_runner = EnvRunner(env, stop_requested)
+            self.metadata = Metadata.of_run(run, registries, env)
             factory = build_factory(run, registries, env)
             self.algorithm: Algorithm = run.trainer.cls(
                 factory, run.trainer.settings, self.env_runner, generator, device

@@ -15,12 +15,13 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 from trainers.evaluate import main
+from trainers.inference.metadata import FILE as METADATA
 from trainers.networks.actor_critic import ActorCritic
 from trainers.networks.observations import Observations
 from trainers.runfile.registry import Registries
-from trainers.runfile.settings import RunSettings
+from trainers.runfile.settings import RunSettings, dump_yaml
 from trainers.saving.checkpoint import Checkpoints
-from trainers.saving.run_folder import begin
+from trainers.saving.run_folder import CONFIGURATION, begin
 from trainers.session import Session
 
 LENGTHS = (2, 4)
@@ -75,7 +76,8 @@ def saved(
         weights["action_head.weight"].zero_()
         weights["action_head.bias"].fill_(3.0)
         session.close()
-        begin(tmp_path / "run", run, resume=False)
+        files = {CONFIGURATION: dump_yaml(run), METADATA: session.metadata.to_json()}
+        begin(tmp_path / "run", files, resume=False)
         Checkpoints(tmp_path / "run/checkpoints", keep=1).save(1, weights, {}, None)
         return tmp_path / "run"
 

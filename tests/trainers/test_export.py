@@ -41,6 +41,7 @@ def test_an_exported_policy_has_the_figures_of_its_run(results: Path, tmp_path: 
         "weights.safetensors",
         "manifest.json",
         "configuration.yaml",
+        "policy.json",
     }
     own = evaluate(str(folder), episodes=8, seed=0)
     assert own == evaluate("toy", episodes=8, seed=0, results_dir=results)

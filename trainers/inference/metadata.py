@@ -12,6 +12,7 @@ import gymnasium
 from pydantic import BaseModel
 
 from encoders.saved_spaces import space_from_plain, space_to_plain
+from envs.environment import Environment
 from trainers.common.errors import UserError
 from trainers.runfile.registry import Entry, Registries
 from trainers.runfile.settings import RunSettings
@@ -55,20 +56,13 @@ class Metadata:
     trainer: Need
 
     @classmethod
-    def of_run(
-        cls,
-        run: RunSettings,
-        registries: Registries,
-        observation_space: gymnasium.spaces.Dict,
-        action_space: gymnasium.Space[Any],
-        privileged: frozenset[str],
-    ) -> Metadata:
+    def of_run(cls, run: RunSettings, registries: Registries, env: Environment) -> Metadata:
         """What a run's policies say of themselves."""
         encoders, trainers = registries.encoders, registries.trainers
         return cls(
-            observation_space,
-            action_space,
-            privileged,
+            env.single_observation_space,
+            env.single_action_space,
+            env.privileged,
             {name: _need(c.name, encoders.get(c.name)) for name, c in run.encoders.items()},
             _need(run.trainer.name, trainers.get(run.trainer.name)),
         )

@@ -87,7 +87,7 @@ class Policy:
         """
         loaded = find_checkpoint(str(folder_or_run), Path(results_dir))
         folder = run_folder(loaded.path)
-        metadata = read_metadata(folder) or _metadata_of_environment(folder)
+        metadata = find_metadata(folder)
         network = _network(loaded, folder, metadata).to(device)
         return cls(network, metadata.observation_space, metadata.action_space, seed)
 
@@ -141,15 +141,24 @@ class Policy:
         return torch.from_numpy(rows.copy()).to(self._device)
 
 
-def _metadata_of_environment(folder: Path) -> Metadata:
-    """That of a policy saved before there were metadata: its environment is built to be asked."""
+def find_metadata(folder: Path) -> Metadata:
+    """What a policy says of itself.
+
+    Where it was saved before policies did, its environment is built to be asked.
+
+    Args:
+        folder: of the run, or of an exported policy.
+
+    Raises:
+        UserError: the file is damaged, or the environment can't be built.
+    """
+    if found := read_metadata(folder):
+        return found
     registries = load_registries()
     run = load_run(folder / CONFIGURATION, ["environment.num_envs=1"], registries)
     env: Environment = run.environment.cls(run.environment.settings, [], 0)
     with closing(env):
-        return Metadata.of_run(
-            run, registries, env.single_observation_space, env.single_action_space, env.privileged
-        )
+        return Metadata.of_run(run, registries, env)
 
 
 def _network(loaded: Loaded, folder: Path, metadata: Metadata) -> PolicyNetwork:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 from trainers.common.errors import UserError
 from trainers.common.files import write_atomically
-from trainers.runfile.settings import RunSettings, dump_yaml
 from trainers.saving.checkpoint import MANIFEST, Checkpoints, Loaded
 
 CONFIGURATION = "configuration.yaml"
@@ -51,14 +50,14 @@ def check(directory: Path, *, resume: bool, force: bool) -> None:
                 )
 
 
-def begin(directory: Path, run: RunSettings, *, resume: bool) -> None:
-    """Makes a run's folder ready, and writes the resolved run file into it.
+def begin(directory: Path, files: Mapping[str, str], *, resume: bool) -> None:
+    """Makes a run's folder ready, and writes into it what its policies are loaded by.
 
     Comes after `check`, and as late as can be: what it replaces is gone.
 
     Args:
         directory: the run's folder.
-        run: what is going to run.
+        files: names and contents: the resolved run file, and what policies say of themselves.
         resume: keep what is there.
 
     Raises:
@@ -68,7 +67,8 @@ def begin(directory: Path, run: RunSettings, *, resume: bool) -> None:
         if directory.exists() and not resume:
             shutil.rmtree(directory)
         directory.mkdir(parents=True, exist_ok=True)
-        write_atomically(directory / CONFIGURATION, dump_yaml(run))
+        for name, content in files.items():
+            write_atomically(directory / name, content)
 
 
 @contextmanager

@@ -10,9 +10,16 @@ import torch
 
 from trainers.common.errors import UserError
 from trainers.runfile.registry import Registries
-from trainers.runfile.settings import RunSettings, load_run
+from trainers.runfile.settings import RunSettings, dump_yaml, load_run
 from trainers.saving.checkpoint import Checkpoints
-from trainers.saving.run_folder import begin, check, find_checkpoint, has_checkpoints, run_folder
+from trainers.saving.run_folder import (
+    CONFIGURATION,
+    begin,
+    check,
+    find_checkpoint,
+    has_checkpoints,
+    run_folder,
+)
 
 
 def save(folder: Path, step: int, score: float | None = None) -> Path:
@@ -24,19 +31,20 @@ def test_a_folder_begins_with_the_settings_that_reproduce_the_run(
     tmp_path: Path, make_run: Callable[..., RunSettings], registries: Registries
 ) -> None:
     run = make_run("target", environment_parameters={"scale": 2.0}, seed=7)
-    begin(tmp_path / "deep/run", run, resume=False)
+    begin(tmp_path / "deep/run", {CONFIGURATION: dump_yaml(run)}, resume=False)
     assert load_run(tmp_path / "deep/run/configuration.yaml", [], registries) == run
 
 
 def test_beginning_afresh_replaces_and_resuming_keeps(
-    tmp_path: Path, make_run: Callable[..., RunSettings]
+    tmp_path: Path,
 ) -> None:
-    run = make_run()
-    begin(tmp_path / "run", run, resume=False)
+    files = {"a.txt": "first"}
+    begin(tmp_path / "run", files, resume=False)
     save(tmp_path / "run", 1)
-    begin(tmp_path / "run", run, resume=True)
+    begin(tmp_path / "run", {"a.txt": "second"}, resume=True)
+    assert (tmp_path / "run/a.txt").read_text() == "second"
     assert has_checkpoints(tmp_path / "run")
-    begin(tmp_path / "run", run, resume=False)
+    begin(tmp_path / "run", files, resume=False)
     assert not has_checkpoints(tmp_path / "run")
 
 
@@ -67,7 +75,7 @@ def test_a_folder_that_can_not_be_made_is_the_users_mistake(
 ) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=r"file.*can't be written: .*--results-dir"):
-        begin(tmp_path / "file/run", make_run(), resume=False)
+        begin(tmp_path / "file/run", {}, resume=False)
 
 
 def test_checkpoints_are_found_by_run_id_by_run_and_by_their_own_path(tmp_path: Path) -> None:

@@ -1,0 +1,49 @@
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary
+
+from encoders.saved_spaces import space_from_plain, space_to_plain
+from encoders.spaces import DepthImage, RgbImage
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        Box(-1.0, 1.0, (4,), np.float32),
+        Box(np.array([-1.0, -np.inf]), np.array([0.1, np.inf]), dtype=np.float32),
+        Box(np.array([-1.0, 0.3]), np.array([0.1, 1e300]), dtype=np.float64),
+        Box(0, 255, (84, 84, 4), np.uint8),
+        Discrete(5),
+        Discrete(3, start=-1),
+        DepthImage(48, 64, (0.4, 2.0), "uint8", 51.2),
+        DepthImage(48, 64),
+        RgbImage(2, 3),
+        Dict({"b": Box(0.0, 1.0, (2,), np.float32), "a": RgbImage(1, 1)}),
+    ],
+)
+def test_a_space_comes_back_through_json(space: gymnasium.Space[Any]) -> None:
+    back = space_from_plain(json.loads(json.dumps(space_to_plain(space), allow_nan=False)))
+    assert back == space
+    assert type(back) is type(space)
+    assert back.dtype == space.dtype
+    if isinstance(space, Dict):
+        assert isinstance(back, Dict)
+        assert list(back.spaces) == list(space.spaces)
+
+
+def test_equal_bounds_are_written_once() -> None:
+    plain = space_to_plain(Box(0, 255, (84, 84, 4), np.uint8))
+    assert plain == {"type": "box", "low": 0, "high": 255, "shape": [84, 84, 4], "dtype": "uint8"}
+
+
+def test_what_can_not_be_written_is_refused() -> None:
+    with pytest.raises(ValueError, match="MultiBinary"):
+        space_to_plain(MultiBinary(3))
+    with pytest.raises(ValueError, match="unknown type 'graph'"):
+        space_from_plain({"type": "graph"})
