@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
@@ -12,6 +13,8 @@ from torch.nn import functional as F
 
 from trainers.algorithms.exploration import GaussianSettings, Noise, NoiseSettings
 from trainers.algorithms.off_policy import (
+    ACTOR,
+    CRITIC,
     OffPolicyAlgorithm,
     OffPolicyHyperparameters,
     OffPolicySettings,
@@ -21,9 +24,6 @@ from trainers.networks.deterministic import DeterministicPolicy, DeterministicSe
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.frame_features import FrameFeatures
 from trainers.networks.observations import Observations
-
-ACTOR, CRITIC = "actor", "critic"
-STATISTICS = ("Losses/Value Loss", "Losses/Policy Loss", "Policy/Q Value")
 
 
 class DDPGHyperparameters(OffPolicyHyperparameters, frozen=True, extra="forbid"):
@@ -65,23 +65,11 @@ class DDPG(OffPolicyAlgorithm):
     ):
         self._hyperparameters = hyper = settings.hyperparameters
         policy = self.build_policy(factory, settings).to(device)
-        online = policy.online
-        self._actor_parameters = online.actor_parameters()
-        self._critic_parameters = online.critic_parameters()
-        super().__init__(
-            policy,
-            settings,
-            hyper,
-            policy.scale,
-            {
-                ACTOR: torch.optim.Adam(self._actor_parameters, fused=True),
-                CRITIC: torch.optim.Adam(self._critic_parameters, fused=True),
-            },
-            {*online.actor_sees, *online.critic_sees},
-            env_runner,
-            generator,
-            device,
-        )
+        parameters = {
+            ACTOR: policy.online.actor_parameters(),
+            CRITIC: policy.online.critic_parameters(),
+        }
+        super().__init__(policy, settings, parameters, env_runner, generator, device)
         self._noise: Noise = hyper.noise.build(self._shape, device)
         # Without a future there is no value to estimate, nor anything to look at.
         self._targets = self._bootstrapped_returns if hyper.gamma else self._buffer.rewards
@@ -104,61 +92,40 @@ class DDPG(OffPolicyAlgorithm):
 
     # -- collecting ------------------------------------------------------------------------------
 
-    def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
-        """See `Behavior.encode_frames`."""
-        return self.policy.online.encode_frames(frames)
-
     def _explore(self, observations: Observations, features: FrameFeatures) -> Tensor:
         actions = self.policy.online.act(observations, features.actor)
-        sigma = self._hyperparameters.sigma(self._env_runner.step_count / self._max_steps)
+        sigma = self._hyperparameters.sigma(self._env_runner.step_count / self._settings.max_steps)
         return (actions + sigma * self._noise.sample(self._generator)).clamp(-1.0, 1.0)
 
-    def _episodes_ended(self, done: NDArray[Any]) -> None:
+    def _episodes_ended(self, done: NDArray[np.bool_]) -> None:
         self._noise.restart(torch.from_numpy(done).to(self._device))
 
     # -- learning --------------------------------------------------------------------------------
 
-    def _begin_updates(self, run_fraction: float) -> dict[str, float]:
-        rate, critic_rate = self._hyperparameters.learning_rates(run_fraction)
-        self._optimizers[ACTOR].param_groups[0]["lr"] = rate
-        self._optimizers[CRITIC].param_groups[0]["lr"] = critic_rate
-        return {
-            "Policy/Learning Rate": rate,
-            "Policy/Critic Learning Rate": critic_rate,
-            "Policy/Noise": self._hyperparameters.sigma(run_fraction),
-        }
+    def _schedule(self, run_fraction: float) -> dict[str, float]:
+        sigma = self._hyperparameters.sigma(run_fraction)
+        return super()._schedule(run_fraction) | {"Policy/Noise": sigma}
 
-    def _update_once(self) -> dict[str, float]:
-        """Updates critic, actor and targets (Lillicrap et al. 2015, algorithm 1)."""
-        hyper = self._hyperparameters
-        for _ in range(hyper.policy_delay):
-            indices = self._buffer.sample(hyper.batch_size, self._generator)
-            value_loss, value = self._improve_critic(indices)
-        policy_loss = self._improve_actor(indices)
-        self.policy.update_targets()
-        numbers = torch.stack([value_loss, policy_loss, value]).tolist()
-        return dict(zip(STATISTICS, numbers, strict=True))
-
-    def _improve_critic(self, indices: NDArray[Any]) -> tuple[Tensor, Tensor]:
-        """Descends the mean of (Q(s, a) - y)^2; returns it, and the mean of Q(s, a)."""
+    def _improve_critic(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
+        """Descends the mean of (Q(s, a) - y)^2 (Lillicrap et al. 2015, algorithm 1)."""
         online = self.policy.online
         targets = self._targets(indices)
         observations = self._augment(self._buffer.observations(indices, online.critic_sees))
         values = online.value(observations, self._buffer.actions(indices))
         loss = F.mse_loss(values, targets)
-        self._optimizer_step(CRITIC, loss, self._critic_parameters)
-        return loss.detach(), values.detach().mean()
+        self._optimizer_step(CRITIC, loss)
+        return {"Losses/Value Loss": loss, "Policy/Q Value": values.mean()}
 
-    def _improve_actor(self, indices: NDArray[Any]) -> Tensor:
-        """Descends the mean of -Q(s, mu(s)); returns it."""
+    def _improve_actor(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
+        """Descends the mean of -Q(s, mu(s))."""
         online = self.policy.online
         observations = self._augment(self._buffer.observations(indices, self._seen))
         loss = -online.value(observations, online.act(observations)).mean()
-        self._optimizer_step(ACTOR, loss, self._actor_parameters)
-        return loss.detach()
+        self._optimizer_step(ACTOR, loss)
+        return {"Losses/Policy Loss": loss}
 
     @torch.no_grad()
-    def _bootstrapped_returns(self, indices: NDArray[Any]) -> Tensor:
+    def _bootstrapped_returns(self, indices: NDArray[np.int64]) -> Tensor:
         """Targets y = R + gamma^k Q'(s', mu'(s')), (B,); R is the return of k steps up to s'."""
         hyper, target = self._hyperparameters, self.policy.target
         returns, discounts, last = self._buffer.returns(indices, hyper.gamma, hyper.n_step)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, model_validator
@@ -19,10 +20,11 @@ from trainers.common.averager import Averager
 from trainers.experience.collector import Acted, CollectedStep, Collector
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.replay_buffer import ReplayBuffer
-from trainers.networks.actions import ActionScaling
 from trainers.networks.frame_features import FrameFeatures
 from trainers.networks.observations import Observations
-from trainers.networks.policy_network import PolicyNetwork
+from trainers.networks.off_policy_network import OffPolicyNetwork
+
+ACTOR, CRITIC = "actor", "critic"
 
 
 class OffPolicyHyperparameters(BaseModel, frozen=True, extra="forbid"):
@@ -93,52 +95,49 @@ class OffPolicySettings(TrainerSettings, frozen=True, extra="forbid"):
     time_horizon: int = Field(
         64, ge=1, description="Steps of each environment between two rounds of updates."
     )
+    hyperparameters: OffPolicyHyperparameters
 
 
 class OffPolicyAlgorithm:
     """Collects transitions into a replay buffer, and updates from it. Implements `Algorithm`.
 
-    A subclass says how to explore, and what an update is.
+    A subclass says how to explore, and how critic and actor improve.
 
     What is collected waits beside the buffer until the update: the buffer, like the weights, stays
     as it is while the run can still be asked to stop, and its state needs no copy.
 
     Args:
         policy: on the device.
-        settings: how long to collect.
-        hyperparameters: what all algorithms of this kind have.
-        scale: actions in [-1, 1] to the bounds of the environment's.
-        optimizers: by name, as checkpoints have them.
-        seen: names of the observations that updates look at.
+        settings: how to collect, and the hyper-parameters.
+        parameters: what is learned, by the name of its optimizer; `critic` has a learning rate of
+            its own.
         env_runner: the environments.
         generator: the source of all randomness.
         device: where the policy lives.
     """
 
-    policy: PolicyNetwork
+    policy: OffPolicyNetwork
     state_size = 0
 
     def __init__(
         self,
-        policy: PolicyNetwork,
+        policy: OffPolicyNetwork,
         settings: OffPolicySettings,
-        hyperparameters: OffPolicyHyperparameters,
-        scale: ActionScaling,
-        optimizers: Mapping[str, torch.optim.Optimizer],
-        seen: Collection[str],
+        parameters: Mapping[str, Sequence[nn.Parameter]],
         env_runner: EnvRunner,
         generator: torch.Generator,
         device: torch.device,
     ):
-        hyper, env, self.policy = hyperparameters, env_runner.env, policy
-        self._time_horizon, self._max_steps = settings.time_horizon, settings.max_steps
-        self._replay, self._scale, self._optimizers = hyper, scale, optimizers
+        self.policy, self._settings, self._replay = policy, settings, settings.hyperparameters
         self._env_runner, self._generator, self._device = env_runner, generator, device
-        self._seen = seen
-        self._shape = (env.num_envs, scale.size)
+        self._parameters = parameters
+        self._optimizers = {k: torch.optim.Adam(p, fused=True) for k, p in parameters.items()}
+        hyper, env, size = settings.hyperparameters, env_runner.env, policy.scale.size
+        self._seen = {*policy.sees, *policy.critic_sees}
+        self._shape = (env.num_envs, size)
         self._max_gradient_norm = hyper.max_gradient_norm or float("inf")
         self._buffer = ReplayBuffer(
-            env.single_observation_space, scale.size, env.num_envs, hyper.buffer_size, device
+            env.single_observation_space, size, env.num_envs, hyper.buffer_size, device
         )
         self._augment = (
             RandomShift(hyper.random_shift_px, generator) if hyper.random_shift_px else unchanged
@@ -150,20 +149,19 @@ class OffPolicyAlgorithm:
     # -- the subclass's --------------------------------------------------------------------------
 
     @abstractmethod
-    def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
-        """See `collector.Behavior.encode_frames`."""
-
-    @abstractmethod
     def _explore(self, observations: Observations, features: FrameFeatures) -> Tensor:
         """Actions (N, A) in [-1, 1], with what the algorithm explores by."""
 
     @abstractmethod
-    def _begin_updates(self, run_fraction: float) -> dict[str, float]:
-        """Sets what is scheduled; returns it by TensorBoard tag."""
+    def _improve_critic(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
+        """One optimizer step of the critic on transitions (B,); statistics by TensorBoard tag."""
 
     @abstractmethod
-    def _update_once(self) -> dict[str, float]:
-        """`policy_delay` updates of the critic and one of the actor; statistics by tag."""
+    def _improve_actor(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
+        """One optimizer step of the actor on transitions (B,); statistics by TensorBoard tag."""
+
+    def _episodes_ended(self, done: NDArray[np.bool_]) -> None:
+        """Called after every step with (N,), for exploration that remembers."""
 
     # -- collecting ------------------------------------------------------------------------------
 
@@ -172,25 +170,26 @@ class OffPolicyAlgorithm:
         """See `Algorithm.collect`."""
         self._collected = []
         self._collector.begin()
-        for _ in range(self._time_horizon):
+        for _ in range(self._settings.time_horizon):
             # No frame is kept here: the buffer has each once.
             step = self._collector.collect_step(self._collector.frame_store(1))
             self._collected.append(step)
             self._episodes_ended(step.step.done)
+
+    def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
+        """See `collector.Behavior.encode_frames`."""
+        return self.policy.encode_frames(frames)
 
     def act(self, observations: Observations, features: FrameFeatures) -> Acted[Tensor]:
         """See `collector.Behavior.act`; the output is the actions (N, A) in [-1, 1]."""
         hyper, hidden_state = self._replay, self._collector.hidden_state
         uniform = 2.0 * self._rand(self._shape) - 1.0
         if self._env_runner.step_count < hyper.buffer_init_steps:
-            return Acted(self._scale(uniform), hidden_state, uniform)
+            return Acted(self.policy.scale(uniform), hidden_state, uniform)
         explored = self._explore(observations, features)
         drawn = self._rand((self._shape[0], 1)) < hyper.random_actions
         actions = torch.where(drawn, uniform, explored)
-        return Acted(self._scale(actions), hidden_state, actions)
-
-    def _episodes_ended(self, done: NDArray[Any]) -> None:
-        """Called after every step with (N,), for exploration that remembers."""
+        return Acted(self.policy.scale(actions), hidden_state, actions)
 
     def _rand(self, shape: tuple[int, int]) -> Tensor:
         return torch.rand(shape, generator=self._generator, device=self._device)
@@ -202,7 +201,7 @@ class OffPolicyAlgorithm:
         collected, self._collected = self._collected, []
         if not collected:
             raise RuntimeError("update() comes after collect()")
-        scheduled = self._begin_updates(run_fraction)
+        scheduled = self._schedule(run_fraction)
         self._remember(collected)
         averager, hyper = Averager(), self._replay
         if len(self._buffer) >= hyper.buffer_init_steps:
@@ -212,6 +211,25 @@ class OffPolicyAlgorithm:
             averager.add(self._update_once())
         return averager.pop_means() | scheduled
 
+    def _schedule(self, run_fraction: float) -> dict[str, float]:
+        """Sets what changes over the run; returns it by TensorBoard tag."""
+        rate, critic_rate = self._replay.learning_rates(run_fraction)
+        for name, optimizer in self._optimizers.items():
+            optimizer.param_groups[0]["lr"] = critic_rate if name == CRITIC else rate
+        return {"Policy/Learning Rate": rate, "Policy/Critic Learning Rate": critic_rate}
+
+    def _update_once(self) -> dict[str, float]:
+        """Updates the critic `policy_delay` times, the actor and the targets once."""
+        hyper = self._replay
+        for _ in range(hyper.policy_delay):
+            indices = self._buffer.sample(hyper.batch_size, self._generator)
+            statistics = self._improve_critic(indices)
+        statistics |= self._improve_actor(indices)
+        self.policy.update_targets()
+        # All at once: on an accelerator each look at a number waits for all that is under way.
+        numbers = torch.stack([value.detach() for value in statistics.values()]).tolist()
+        return dict(zip(statistics, numbers, strict=True))
+
     def _remember(self, collected: Sequence[CollectedStep[Tensor]]) -> None:
         """Adds what was collected to the buffer and to the statistics of the observations."""
         for step in collected:
@@ -220,14 +238,19 @@ class OffPolicyAlgorithm:
         vectors = [step.vectors for step in collected]
         self.policy.update_statistics({k: torch.cat([v[k] for v in vectors]) for k in vectors[0]})
 
-    def _optimizer_step(self, name: str, loss: Tensor, parameters: Sequence[nn.Parameter]) -> None:
-        """One step of an optimizer, with clipped gradients.
+    def _optimizer_step(self, name: str, loss: Tensor) -> None:
+        """One step of the optimizer of that name, with clipped gradients.
 
         Raises:
             NonFiniteError: the loss or its gradient is NaN or infinite; nothing was changed.
         """
-        step = self._env_runner.step_count
-        optimizer_step(self._optimizers[name], loss, parameters, self._max_gradient_norm, step)
+        optimizer_step(
+            self._optimizers[name],
+            loss,
+            self._parameters[name],
+            self._max_gradient_norm,
+            self._env_runner.step_count,
+        )
 
     # -- the state -------------------------------------------------------------------------------
 

@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 import torch
 from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor, nn
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from trainers.networks.actions import ActionScaling
 from trainers.networks.actor_critic import ACTOR_GAIN, CRITIC_GAIN, ActorCriticSettings, observed
@@ -16,7 +15,7 @@ from trainers.networks.factory import NetworkFactory
 from trainers.networks.frame_features import FrameFeatures
 from trainers.networks.network import Network, NetworkSettings, head, hidden_layers
 from trainers.networks.observations import Observations
-from trainers.networks.policy_network import PolicyNetwork
+from trainers.networks.off_policy_network import OffPolicyNetwork, TargetAverage
 
 ENCODERS_ALONE = {"num_layers": 0}
 
@@ -110,7 +109,7 @@ class DeterministicActorCritic(nn.Module):
         return [*self.critic_encoder.parameters(), *self.critic.parameters()]
 
 
-class DeterministicPolicy(PolicyNetwork):
+class DeterministicPolicy(OffPolicyNetwork):
     """The networks that learn, and their targets.
 
     Args:
@@ -122,7 +121,6 @@ class DeterministicPolicy(PolicyNetwork):
     Attributes:
         online: what learns.
         target: what follows it.
-        scale: actions in [-1, 1] to the bounds of the environment's.
     """
 
     def __init__(
@@ -135,11 +133,10 @@ class DeterministicPolicy(PolicyNetwork):
         super().__init__()
         self.online = DeterministicActorCritic(factory, settings)
         self.target = copy.deepcopy(self.online).requires_grad_(False)
-        self.sees = self.online.actor_sees
+        self.sees, self.critic_sees = self.online.actor_sees, self.online.critic_sees
         self.scale = ActionScaling(factory.action_space)
         self._final_sigma = final_sigma
-        self._average = get_ema_multi_avg_fn(1.0 - tau)
-        self._pairs = list(self.target.parameters()), list(self.online.parameters())
+        self._average = TargetAverage(self.target, self.online, tau)
 
     def act(
         self, observations: Observations, *, deterministic: bool, generator: torch.Generator
@@ -155,17 +152,20 @@ class DeterministicPolicy(PolicyNetwork):
             actions = (actions + self._final_sigma * noise).clamp(-1.0, 1.0)
         return self.scale(actions), self.initial_state(len(actions))
 
+    def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
+        """See `OffPolicyNetwork.encode_frames`."""
+        return self.online.encode_frames(frames)
+
     def update_targets(self) -> None:
-        """Moves the targets towards what learns: target += tau (online - target)."""
-        self._average(*self._pairs, 0)
+        """See `OffPolicyNetwork.update_targets`."""
+        self._average.update()
 
     def update_statistics(self, vectors: dict[str, Tensor]) -> None:
-        """Shows vector observations to the encoders that standardise; targets see alike."""
+        """See `PolicyNetwork.update_statistics`; the targets see alike."""
         self.online.critic_encoder.update_statistics(vectors)
         if self.online.actor_encoder is not None:
             self.online.actor_encoder.update_statistics(vectors)
-        for theirs, ours in zip(self.target.buffers(), self.online.buffers(), strict=True):
-            theirs.copy_(ours)
+        self._average.copy_buffers()
 
 
 def _layers(inputs: int, outputs: int, gain: float, settings: NetworkSettings) -> list[nn.Module]:
