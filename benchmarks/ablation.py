@@ -2,41 +2,31 @@
 
     python -m benchmarks.ablation [--page docs/recipe.md]
 
-Each row is trained from scratch for the same number of steps with each seed, and evaluated with
-`trainers.evaluate`. Each run leaves a file of results, and what is there is not trained again.
+The changes are in `benchmarks/ablation.yaml`. Each row is trained from scratch for the same number
+of steps with each seed, and evaluated with `trainers.evaluate`. Each run leaves a file of results,
+and what is there is not trained again.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
 from rich.console import Console
-from rich.table import Table
 
-from benchmarks.jobs import ROOT, Job, run_missing
-from benchmarks.page import markdown, write_between
+from benchmarks.command import tells_mistakes
+from benchmarks.runs import ROOT, Job, add_options, run_missing
+from benchmarks.tables import markdown, table, write_between
 
 RUN_FILE = ROOT / "config" / "run.yaml"
+CHANGES_FILE = Path(__file__).with_suffix(".yaml")
 HEAD = ("change", "first action", "position (mm)", "yaw (deg)")
-PPO = """trainer={
-    trainer_type: ppo, summary_freq: 50000, checkpoint_interval: 250000,
-    hyperparameters: {batch_size: 1024, buffer_size: 16384, num_epoch: 2, learning_rate: 2e-3,
-        learning_rate_schedule: linear, gamma: 0.0, target_kl: 0.3, beta: 0.0},
-    network_settings: {hidden_units: 256, num_layers: 2, critic: separate,
-        critic_observations: [privileged], initial_std: 0.3, min_std: 0.005}}"""
-MORE_REWARDS = """rewards=[
-    {type: touch}, {type: collision}, {type: position}, {type: rotation},
-    {type: precision, gain: 0.1}]"""
-PAPER_REWARDS = """rewards=[
-    {type: touch}, {type: collision}, {type: position}, {type: rotation},
-    {type: approach, gain: 0.03}, {type: facing, gain: 0.01}]"""
 
 
 @dataclass(frozen=True)
@@ -51,53 +41,21 @@ class Change:
 
     slug: str
     text: str
-    overrides: tuple[str, ...] = ()
+    overrides: Sequence[str]
 
 
-CAMERA = "environment.cameras.depth"
-HYPER = "trainer.hyperparameters"
-CHANGES = (
-    Change("none", "none: config/run.yaml"),
-    Change(
-        "upright",
-        "the camera upright, 62° to see as much",
-        (f"{CAMERA}.roll_deg=0", f"{CAMERA}.fov_deg=62", f"{CAMERA}.target_m=[1.20, 0.0, 0.68]"),
-    ),
-    Change(
-        "aside",
-        "the camera from the side, as `cameras` has it by default",
-        (
-            f"{CAMERA}={{type: depth, width: 80, height: 80, "
-            "range_m: [0.4, 2.0], noise_sigma_m: 0.002}",
-        ),
-    ),
-    Change(
-        "paper-encoder",
-        "the encoder `paper`, learning rate 1e-3",
-        ("encoders.depth={type: paper, size: 80}", f"{HYPER}.learning_rate=1e-3"),
-    ),
-    Change(
-        "image-critic",
-        "a critic that sees the image, too, not the true state",
-        ("trainer.network_settings.critic_observations=[depth]",),
-    ),
-    Change("ppo", "PPO instead of DDPG", (PPO,)),
-    Change("more-rewards", "`touch`, `position`, `rotation` beside `precision`", (MORE_REWARDS,)),
-    Change("paper-rewards", "the paper's rewards, without `precision`", (PAPER_REWARDS,)),
-    Change("linear-noise", "noise that falls linearly", (f"{HYPER}.noise.schedule.type=linear",)),
-    Change("slower", "learning rate 2e-3", (f"{HYPER}.learning_rate=2e-3",)),
-    Change(
-        "larger-batches",
-        "batches of 512, half as many",
-        (f"{HYPER}.batch_size=512", f"{HYPER}.updates_per_step=0.0078125"),
-    ),
-)
+def load_changes() -> dict[str, Change]:
+    """The changes by their slugs, in the order of the table."""
+    entries = yaml.safe_load(CHANGES_FILE.read_text())
+    return {slug: Change(slug, **entry) for slug, entry in entries.items()}
 
 
+@tells_mistakes
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains and evaluates what is missing, and reports on all."""
-    options = parse(arguments)
-    changes = [change for change in CHANGES if change.slug in options.changes]
+    known = load_changes()
+    options = parse(arguments, list(known))
+    changes = [change for slug, change in known.items() if slug in options.changes]
     jobs = {
         (change.slug, seed): job_of(change, seed, options.steps, options.results)
         for seed in options.seeds
@@ -109,25 +67,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows = [
         row(change, [reports[change.slug, seed] for seed in options.seeds]) for change in changes
     ]
-    table = Table(*HEAD, title=f"{options.steps:,} steps, {len(options.seeds)} seeds")
-    for cells in rows:
-        table.add_row(*cells)
-    Console().print(table)
+    title = f"{options.steps:,} steps, {len(options.seeds)} seeds"
+    Console().print(table(title, HEAD, rows))
     if options.page is not None:
         write_between(options.page, "ablation", markdown(HEAD, rows))
     return 0
 
 
-def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+def parse(arguments: Sequence[str] | None, slugs: Sequence[str]) -> argparse.Namespace:
     """Reads the command line."""
-    slugs = [change.slug for change in CHANGES]
     parser = argparse.ArgumentParser(prog="python -m benchmarks.ablation", description=__doc__)
     parser.add_argument("--changes", nargs="+", choices=slugs, default=slugs)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--steps", type=int, default=300_000, help="of each run")
-    parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), help="at a time")
-    parser.add_argument("--results", type=Path, default=Path("results/ablation"), metavar="DIR")
-    parser.add_argument("--page", type=Path, metavar="FILE", help="write the table as Markdown")
+    add_options(parser, "results/ablation")
     return parser.parse_args(arguments)
 
 

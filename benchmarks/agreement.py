@@ -14,12 +14,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.tables import table
 from envs.grasp.scene.sampler import Scenes, SceneSampler
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Camera, GraspSettings, Support
@@ -34,16 +34,14 @@ COLOR_TOLERANCE = 2
 EDGE_M = 0.005
 # Growing every half extent by this moves no corner by more than a millimetre.
 NEARLY_TOUCHING_M = 0.001 / np.sqrt(3.0)
-PICTURE_SCENES = 4
-PICTURE_SIDE_PX = 240
-PICTURE_DIFFERENCE_M = 0.005
-TARGETS = {
-    "all_pixels": None,
-    "depth": 0.99,
-    "color": None,
-    "contacts": 0.995,
-    "contacts_or_near": 1.0,
+FIGURES = {
+    "all_pixels": (f"pixels within {1000 * DEPTH_TOLERANCE_M:g} mm of depth", None),
+    "depth": (f"pixels off edges within {1000 * DEPTH_TOLERANCE_M:g} mm of depth", 0.99),
+    "color": (f"pixels off edges within {COLOR_TOLERANCE} of 255 levels of color", None),
+    "contacts": ("motions with the same contacts", 0.995),
+    "contacts_or_near": ("the same, or with shapes within 1 mm of it", 1.0),
 }
+"""What each figure of `Agreement` is, and how much of it there must be."""
 
 Images = NDArray[Any]
 Flags = NDArray[np.bool_]
@@ -51,19 +49,10 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Agreement:
-    """What was found.
+    """What was found: shares of the pixels and of the motions.
 
-    Attributes:
-        scenes: how many were compared.
-        motions: how many.
-        off_edges: share of the pixels that lie off edges; see `off_edges`.
-        all_pixels: share of all pixels that differ by no more than `DEPTH_TOLERANCE_M` of depth.
-        depth: the same of the pixels off edges.
-        color: share of the pixels off edges that differ by no more than `COLOR_TOLERANCE` levels.
-        contacts: share of the motions whose flags are the same.
-        contacts_or_near: the same, with those that PyBullet would change within a millimetre.
-        touched: share of the motions that did, by PyBullet.
-        collided: the same.
+    `FIGURES` says what most are; `off_edges` is the share of the pixels that lie off edges, and
+    `touched` and `collided` are shares of the motions, by PyBullet.
     """
 
     scenes: int
@@ -105,16 +94,13 @@ class Sample:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compares, prints a table, and writes a picture and JSON where asked."""
+    """Compares, prints a table, and writes JSON where asked; 1 if they agree too little."""
     options = parse(arguments)
-    found, pictures = compare(options.scenes, options.motions, tuple(options.size), options.seed)
-    if options.picture is not None:
-        options.picture.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(options.picture), draw(*pictures))
+    found, _ = compare(options.scenes, options.motions, tuple(options.size), options.seed)
     if options.json is not None:
         options.json.write_text(json.dumps(asdict(found), indent=2) + "\n")
-    Console().print(table(found))
-    met = [getattr(found, name) >= target for name, target in TARGETS.items() if target is not None]
+    Console().print(shown(found))
+    met = [getattr(found, name) >= (least or 0.0) for name, (_, least) in FIGURES.items()]
     return 0 if all(met) else 1
 
 
@@ -125,7 +111,6 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--motions", type=int, default=20, help="of each scene")
     parser.add_argument("--size", type=int, nargs=2, default=[80, 80], metavar=("W", "H"))
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the differences here")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here, too")
     return parser.parse_args(arguments)
 
@@ -254,44 +239,19 @@ def grown(scenes: Scenes, grow_m: float) -> Scenes:
     return scenes.with_arrays({"box_half_m": np.where(half > 0.0, half + grow_m, 0.0)})
 
 
-def draw(exact: Images, fast: Images) -> Images:
-    """Both depths and their difference, a row for each of the scenes that differ the most."""
-    error = difference(exact, fast)
-    worst = np.argsort(-(error > DEPTH_TOLERANCE_M).sum(axis=(1, 2)), kind="stable")
-    rows = []
-    for scene in worst[:PICTURE_SCENES]:
-        panels = [1.0 - np.clip((depth[scene] - 0.4) / 1.6, 0.0, 1.0) for depth in (exact, fast)]
-        panels.append(np.clip(error[scene] / PICTURE_DIFFERENCE_M, 0.0, 1.0))
-        images = []
-        maps = (cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_HOT)
-        for panel, colors in zip(panels, maps, strict=True):
-            image = cv2.applyColorMap((255.0 * panel).astype(np.uint8), colors)
-            side = (PICTURE_SIDE_PX * image.shape[1] // image.shape[0], PICTURE_SIDE_PX)
-            images.append(cv2.resize(image, side, interpolation=cv2.INTER_NEAREST))
-        rows.append(np.hstack(images))
-    return np.vstack(rows)
-
-
-def table(found: Agreement) -> Table:
+def shown(found: Agreement) -> Table:
     """The figures for people."""
-    result = Table(title=f"fast against pybullet: {found.scenes} scenes, {found.motions} motions")
-    for column in ("", "agree", "at least"):
-        result.add_column(column, justify="right" if column else "left")
-    names = {
-        "all_pixels": f"pixels within {1000 * DEPTH_TOLERANCE_M:g} mm of depth",
-        "depth": f"pixels off edges within {1000 * DEPTH_TOLERANCE_M:g} mm of depth",
-        "color": f"pixels off edges within {COLOR_TOLERANCE} of 255 levels of color",
-        "contacts": "motions with the same contacts",
-        "contacts_or_near": "the same, or with shapes within 1 mm of it",
-    }
-    for name, target in TARGETS.items():
-        wanted = "" if target is None else f"{target:.1%}"
-        result.add_row(names[name], f"{getattr(found, name):.3%}", wanted)
-    result.caption = (
+    rows = [
+        (what, f"{getattr(found, name):.3%}", "" if least is None else f"{least:.1%}")
+        for name, (what, least) in FIGURES.items()
+    ]
+    return table(
+        f"fast against pybullet: {found.scenes} scenes, {found.motions} motions",
+        ("", "agree", "at least"),
+        rows,
         f"{found.off_edges:.0%} of the pixels are off edges; "
-        f"{found.touched:.0%} of the motions touch, {found.collided:.0%} collide"
+        f"{found.touched:.0%} of the motions touch, {found.collided:.0%} collide",
     )
-    return result
 
 
 if __name__ == "__main__":

@@ -70,15 +70,11 @@ class PeerVecEnv(VecEnv):
         """An attribute, the same for all environments."""
         return [getattr(self._env, attr_name) for _ in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+    def set_attr(self, *_: Any, **__: Any) -> None:
         """Not there: the environments are one object."""
-        raise NotImplementedError("the environments are one object: they have no attributes each")
+        raise NotImplementedError("the environments are one object: there is none to ask or tell")
 
-    def env_method(
-        self, method_name: str, *arguments: Any, indices: Indices = None, **options: Any
-    ) -> list[Any]:
-        """Not there: the environments are one object."""
-        raise NotImplementedError("the environments are one object: they have no methods each")
+    env_method = set_attr
 
     def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> Sequence[bool]:
         """None of them is."""

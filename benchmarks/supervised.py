@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -26,6 +25,7 @@ from rich.console import Console
 from torch import Tensor
 from torch.nn import functional as F
 
+from benchmarks.command import tells_mistakes
 from envs.grasp.scene.sampler import heading
 from envs.grasp.task import goal_middle_m
 from envs.grasp.vector_env import GraspVectorEnv
@@ -34,7 +34,6 @@ from trainers.algorithms.ppo import PPOSettings
 from trainers.algorithms.trpo import TRPOSettings
 from trainers.common.errors import UserError
 from trainers.evaluation import FIRST_SEED, final_parameters
-from trainers.learn import DONE, MISTAKE
 from trainers.networks.actions import to_environment
 from trainers.networks.actor_critic import ActorCritic
 from trainers.networks.deterministic import DeterministicActorCritic
@@ -52,15 +51,22 @@ WARM_UP_STEPS = 100
 MAX_GRADIENT_NORM = 5.0
 
 
+@tells_mistakes
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fits, and prints how far it has come; returns the exit code."""
+    """Fits, and prints how far it has come."""
     options = parse(arguments)
-    try:
-        _fit_and_print(options)
-    except UserError as mistake:
-        print(f"error: {mistake}", file=sys.stderr)
-        return MISTAKE
-    return DONE
+    registries = load_registries()
+    run = load_run(options.config, [*options.overrides, "environment.num_envs=256"], registries)
+    torch.manual_seed(options.seed)
+    with (
+        closing(_environment(run, options.seed)) as training,
+        closing(_environment(run, FIRST_SEED)) as unseen,
+    ):
+        policy = build_policy(run.trainer.settings, build_factory(run, registries, training))
+        for share, images in fit(policy, training, options.minutes * 60, options.learning_rate):
+            figures = ", ".join(f"{name} {value}" for name, value in judge(policy, unseen).items())
+            Console().print(f"{share * options.minutes:.1f} min, {images:,} images: {figures}")
+    return 0
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -165,20 +171,6 @@ def _tolerances(env: GraspVectorEnv) -> Tensor:
     return torch.tensor(
         [2.0 * a / (high - low) for a, (_, (low, high)) in zip(allowed, workspace, strict=True)]
     )
-
-
-def _fit_and_print(options: argparse.Namespace) -> None:
-    registries = load_registries()
-    run = load_run(options.config, [*options.overrides, "environment.num_envs=256"], registries)
-    torch.manual_seed(options.seed)
-    with (
-        closing(_environment(run, options.seed)) as training,
-        closing(_environment(run, FIRST_SEED)) as unseen,
-    ):
-        policy = build_policy(run.trainer.settings, build_factory(run, registries, training))
-        for share, images in fit(policy, training, options.minutes * 60, options.learning_rate):
-            figures = ", ".join(f"{name} {value}" for name, value in judge(policy, unseen).items())
-            Console().print(f"{share * options.minutes:.1f} min, {images:,} images: {figures}")
 
 
 def _environment(run: RunSettings, seed: int) -> GraspVectorEnv:

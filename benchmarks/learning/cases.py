@@ -5,13 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-RUN_FILES = Path(__file__).parents[2] / "config" / "gymnasium"
+from benchmarks.runs import ROOT
+
+RUN_FILES = ROOT / "config" / "gymnasium"
+PLUGINS = {"sac": Path("examples/ventosa-sac-plugin")}
+"""Algorithms that are packages of their own, with run files for each task."""
 OURS, PEER = "ventosa", "peer"
 SIDES = (OURS, PEER)
 PEER_NAMES = {
     "ppo": "Stable-Baselines3 PPO",
     "trpo": "sb3-contrib TRPO",
     "ddpg": "Stable-Baselines3 DDPG",
+    "sac": "Stable-Baselines3 SAC",
 }
 
 
@@ -28,17 +33,19 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Both, as in the run file's name."""
+        """Both, in names of files."""
         return f"{self.task}_{self.algorithm}"
 
     @property
     def run_file(self) -> Path:
         """Where the hyper-parameters are, for both sides."""
+        if self.algorithm in PLUGINS:
+            return ROOT / PLUGINS[self.algorithm] / "config" / f"{self.task}.yaml"
         return RUN_FILES / f"{self.name}.yaml"
 
 
 # Fewer steps than the run files have, where two cores would need days for all the seeds; and fewer
-# seeds of DDPG, whose step is ten times as dear.
+# seeds off-policy, where a step is ten times as dear.
 CASES = (
     Case("ppo", "pendulum", 100_000),
     Case("ppo", "half_cheetah", 100_000),
@@ -49,6 +56,8 @@ CASES = (
     Case("ddpg", "pendulum", 20_000, seeds=5),
     Case("ddpg", "half_cheetah", 30_000, seeds=5),
     Case("ddpg", "hopper", 30_000, seeds=5),
+    Case("sac", "pendulum", 20_000, seeds=3),
+    Case("sac", "hopper", 100_000, seeds=3),
 )
 
 

@@ -1,15 +1,14 @@
-"""One run of one side, in a process of its own: `python -m benchmarks.learning.run`."""
+"""One run of one side, in a process of its own, which `benchmarks.learning` starts."""
 
 from __future__ import annotations
 
-import argparse
 import json
-from collections.abc import Sequence
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.learning import ours, theirs
-from benchmarks.learning.cases import OURS, PEER, SIDES, Case, Entry
+from benchmarks.learning.cases import OURS, PEER, Case, Entry
 from benchmarks.learning.evaluation import Referee, returns
 from trainers.common.files import write_atomically
 from trainers.runfile.registry import load_registries
@@ -22,23 +21,8 @@ FINAL_EPISODES_EACH = 3
 LEARNERS = {OURS: ours.learn, PEER: theirs.learn}
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Learns, evaluates, and writes what came out."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.learning.run", description=__doc__)
-    parser.add_argument("algorithm")
-    parser.add_argument("task")
-    parser.add_argument("steps", type=int)
-    parser.add_argument("side", choices=SIDES)
-    parser.add_argument("seed", type=int)
-    parser.add_argument("--to", type=Path, required=True, help="the file of results")
-    options = parser.parse_args(arguments)
-    case = Case(options.algorithm, options.task, options.steps)
-    play(Entry(case, options.side, options.seed), options.to)
-    return 0
-
-
 def play(entry: Entry, path: Path) -> None:
-    """Does one run, and writes its results as JSON."""
+    """Learns, evaluates, and writes what came out as JSON."""
     registries = load_registries()
     overrides = [f"trainer.max_steps={entry.case.steps}", f"seed={entry.seed}"]
     run = load_run(entry.case.run_file, overrides, registries)
@@ -61,4 +45,5 @@ def play(entry: Entry, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    algorithm, task, steps, side, seed, file = sys.argv[1:]
+    play(Entry(Case(algorithm, task, int(steps)), side, int(seed)), Path(file))

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sb3_contrib import TRPO
-from stable_baselines3 import DDPG, PPO
+from stable_baselines3 import DDPG, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
@@ -23,7 +23,6 @@ from trainers.algorithms.ddpg import DDPGSettings
 from trainers.algorithms.ppo import PPOSettings
 from trainers.algorithms.schedules import Schedule
 from trainers.algorithms.trpo import TRPOSettings
-from trainers.networks.actor_critic import PolicySettings
 from trainers.networks.network import ACTIVATIONS, NetworkSettings
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings
@@ -34,7 +33,7 @@ def learn(run: RunSettings, registries: Registries, referee: Referee) -> Act:
     """Learns with the same environment and hyper-parameters; returns the final policy."""
     settings = run.trainer.settings
     env = _normalized(PeerVecEnv(build_environment(run, run.seed)), settings)
-    model = _BUILDERS[type(settings)](settings, env, run.seed)
+    model = build(run, env)
     act = _policy_of(model, env)
     referee.start()
     model.learn(settings.max_steps, _Watch(referee, act))  # type: ignore[attr-defined]
@@ -76,81 +75,99 @@ def _policy_of(model: BaseAlgorithm, env: VecEnv) -> Act:
     return act
 
 
-def _ppo(settings: PPOSettings, env: VecEnv, seed: int) -> PPO:
-    hyper, networks = settings.hyperparameters, settings.network_settings
-    return PPO(
-        "MlpPolicy",
-        env,
-        learning_rate=_course(hyper.learning_rate, hyper.learning_rate_schedule),
-        n_steps=hyper.buffer_size // env.num_envs,
-        batch_size=hyper.batch_size,
-        n_epochs=hyper.num_epoch,
-        gamma=hyper.gamma,
-        gae_lambda=hyper.lambd,
-        clip_range=_course(hyper.epsilon, hyper.epsilon_schedule),
-        clip_range_vf=hyper.value_clipping,
-        ent_coef=hyper.beta,
-        vf_coef=hyper.value_coefficient,
-        max_grad_norm=hyper.max_gradient_norm,
-        target_kl=hyper.target_kl,
-        policy_kwargs=_actor_critic(networks, env),
-        seed=seed,
-        device="cpu",
-    )
+def build(run: RunSettings, env: VecEnv) -> BaseAlgorithm:
+    """The peer of the run's trainer, which is found by its name."""
+    cls, options = PEERS[run.trainer.name]
+    own = options(run.trainer.settings, env)
+    return cls("MlpPolicy", env, seed=run.seed, device="cpu", **own)
 
 
-def _trpo(settings: TRPOSettings, env: VecEnv, seed: int) -> TRPO:
-    hyper, networks = settings.hyperparameters, settings.network_settings
+def ppo(settings: PPOSettings, env: VecEnv) -> dict[str, Any]:
+    """Arguments of Stable-Baselines3's PPO."""
+    hyper = settings.hyperparameters
+    return {
+        **_on_policy(settings, env),
+        "n_epochs": hyper.num_epoch,
+        "clip_range": _course(hyper.epsilon, hyper.epsilon_schedule),
+        "clip_range_vf": hyper.value_clipping,
+        "ent_coef": hyper.beta,
+        "vf_coef": hyper.value_coefficient,
+        "max_grad_norm": hyper.max_gradient_norm,
+        "target_kl": hyper.target_kl,
+    }
+
+
+def _trpo(settings: TRPOSettings, env: VecEnv) -> dict[str, Any]:
+    hyper = settings.hyperparameters
     # Of a Gaussian policy sb3-contrib takes the mean KL of the action's dimensions, not their sum,
     # and so the mean of their Fisher matrices: both bounds per dimension make it the same step.
     dimensions = math.prod(env.action_space.shape or ())
-    return TRPO(
-        "MlpPolicy",
-        env,
-        learning_rate=_course(hyper.learning_rate, hyper.learning_rate_schedule),
-        n_steps=hyper.buffer_size // env.num_envs,
-        batch_size=hyper.batch_size,
-        gamma=hyper.gamma,
-        cg_max_steps=hyper.cg_iterations,
-        cg_damping=hyper.damping / dimensions,
-        line_search_shrinking_factor=hyper.backtrack_coefficient,
-        line_search_max_iter=hyper.backtrack_iterations,
-        n_critic_updates=hyper.num_epoch,
-        gae_lambda=hyper.lambd,
-        target_kl=hyper.delta / dimensions,
-        sub_sampling_factor=round(1 / hyper.fisher_fraction),
-        policy_kwargs=_actor_critic(networks, env),
-        seed=seed,
-        device="cpu",
-    )
+    return {
+        **_on_policy(settings, env),
+        "cg_max_steps": hyper.cg_iterations,
+        "cg_damping": hyper.damping / dimensions,
+        "line_search_shrinking_factor": hyper.backtrack_coefficient,
+        "line_search_max_iter": hyper.backtrack_iterations,
+        "n_critic_updates": hyper.num_epoch,
+        "target_kl": hyper.delta / dimensions,
+        "sub_sampling_factor": round(1 / hyper.fisher_fraction),
+    }
 
 
-def _ddpg(settings: DDPGSettings, env: VecEnv, seed: int) -> DDPG:
+def _on_policy(settings: PPOSettings | TRPOSettings, env: VecEnv) -> dict[str, Any]:
+    hyper, networks = settings.hyperparameters, settings.network_settings
+    policy = _networks(networks, eps=1e-5)  # their default, which other arguments take away
+    if isinstance(env.action_space, gymnasium.spaces.Box):
+        policy["log_std_init"] = math.log(networks.initial_std)
+    return {
+        "learning_rate": _course(hyper.learning_rate, hyper.learning_rate_schedule),
+        "n_steps": hyper.buffer_size // env.num_envs,
+        "batch_size": hyper.batch_size,
+        "gamma": hyper.gamma,
+        "gae_lambda": hyper.lambd,
+        "policy_kwargs": policy,
+    }
+
+
+def _ddpg(settings: DDPGSettings, env: VecEnv) -> dict[str, Any]:
+    hyper, size = settings.hyperparameters, env.action_space.shape or ()
+    return {
+        **_off_policy(settings, env),
+        "learning_rate": _course(hyper.learning_rate, hyper.learning_rate_schedule),
+        "action_noise": NormalActionNoise(np.zeros(size), np.full(size, hyper.noise.sigma)),
+    }
+
+
+def _sac(settings: Any, env: VecEnv) -> dict[str, Any]:
     hyper = settings.hyperparameters
-    size = env.action_space.shape or ()
-    return DDPG(
-        "MlpPolicy",
-        env,
-        learning_rate=_course(hyper.learning_rate, hyper.learning_rate_schedule),
-        buffer_size=hyper.buffer_size,
-        learning_starts=hyper.buffer_init_steps,
-        batch_size=hyper.batch_size,
-        tau=hyper.tau,
-        gamma=hyper.gamma,
-        train_freq=1,
-        gradient_steps=round(hyper.updates_per_step * env.num_envs),
-        action_noise=NormalActionNoise(np.zeros(size), np.full(size, hyper.noise.sigma)),
-        policy_kwargs=_networks(settings.network_settings),
-        seed=seed,
-        device="cpu",
-    )
+    return {
+        **_off_policy(settings, env),
+        "learning_rate": hyper.learning_rate,
+        "ent_coef": f"auto_{hyper.init_entropy_coefficient}",
+    }
 
 
-_BUILDERS: dict[type, Callable[..., BaseAlgorithm]] = {
-    PPOSettings: _ppo,
-    TRPOSettings: _trpo,
-    DDPGSettings: _ddpg,
+def _off_policy(settings: Any, env: VecEnv) -> dict[str, Any]:
+    hyper = settings.hyperparameters
+    return {
+        "buffer_size": hyper.buffer_size,
+        "learning_starts": hyper.buffer_init_steps,
+        "batch_size": hyper.batch_size,
+        "tau": hyper.tau,
+        "gamma": hyper.gamma,
+        "train_freq": 1,
+        "gradient_steps": round(hyper.updates_per_step * env.num_envs),
+        "policy_kwargs": _networks(settings.network_settings),
+    }
+
+
+PEERS: dict[str, tuple[Callable[..., BaseAlgorithm], Callable[[Any, VecEnv], dict[str, Any]]]] = {
+    "ppo": (PPO, ppo),
+    "trpo": (TRPO, _trpo),
+    "ddpg": (DDPG, _ddpg),
+    "sac": (SAC, _sac),
 }
+"""By our trainer's name: the peer, and its arguments from our trainer's settings."""
 
 
 def _networks(settings: NetworkSettings, **optimizer: float) -> dict[str, Any]:
@@ -161,13 +178,6 @@ def _networks(settings: NetworkSettings, **optimizer: float) -> dict[str, Any]:
         "optimizer_kwargs": {"fused": True, **optimizer},
         "optimizer_class": torch.optim.Adam,
     }
-
-
-def _actor_critic(settings: PolicySettings, env: VecEnv) -> dict[str, Any]:
-    networks = _networks(settings, eps=1e-5)  # their default, which other arguments take away
-    if isinstance(env.action_space, gymnasium.spaces.Box):
-        networks["log_std_init"] = math.log(settings.initial_std)
-    return networks
 
 
 def _course(initial: float, schedule: Schedule) -> Callable[[float], float]:

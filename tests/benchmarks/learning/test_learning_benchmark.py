@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict
 
-from benchmarks.learning.cases import CASES, Case
+from benchmarks.learning.cases import CASES, PEER_NAMES, PLUGINS, RUN_FILES, Case, Entry
 from benchmarks.learning.evaluation import Referee, returns
+from benchmarks.runs import ROOT
 from envs.environment import Environment
+from trainers.networks.network import NetworkSettings
+from trainers.runfile.settings import Component
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("scipy")
 
-from benchmarks.learning.report import draw, half_interval, summaries, write_page
+from benchmarks.learning import __main__ as learning
+from benchmarks.learning.report import HEAD, half_interval, rows
 
 LENGTHS = (2, 3)
 
@@ -98,32 +105,95 @@ RESULTS = [
 ]
 
 
-def test_a_summary_has_means_and_speeds_of_both_sides() -> None:
-    (summary,) = summaries(RESULTS)
-    assert summary.sides["ventosa"].mean == pytest.approx(-160.0)
-    assert summary.sides["peer"].mean == pytest.approx(-170.0)
-    assert summary.sides["peer"].steps_per_second == pytest.approx(1000 / 3.0)
-
-
-def test_the_page_keeps_what_is_around_the_table(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text("before\n<!-- learning -->\nold\n<!-- end of learning -->\nafter\n")
-    write_page(page, summaries(RESULTS))
-    text = page.read_text()
-    assert text.startswith("before\n<!-- learning -->\n| task |")
-    assert text.endswith("<!-- end of learning -->\nafter\n")
-    assert "| pendulum | 1,000 | ppo | 3 | -160 ± 25 | -170 ± 25 | 333 | 333 |" in text
-    assert "old" not in text
-
-
-def test_curves_are_drawn(tmp_path: Path) -> None:
-    draw(RESULTS, tmp_path)
-    assert (tmp_path / "learning_ppo.png").stat().st_size > 1000
+def test_a_row_has_means_and_median_speeds_of_both_sides() -> None:
+    row = ["pendulum", "1,000", "ppo", "3", "-160 ± 25", "-170 ± 25", "333", "333"]
+    assert rows(RESULTS) == [row]
+    assert len(HEAD) == len(row)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_every_case_has_a_run_file(case: Case) -> None:
+def test_every_case_has_a_run_file_and_a_peer(case: Case) -> None:
+    plugin = PLUGINS.get(case.algorithm)
+    if plugin is None:
+        assert case.run_file.parent == RUN_FILES
+    else:
+        assert case.run_file == ROOT / plugin / "config" / f"{case.task}.yaml"
+    if plugin is not None and not (ROOT / plugin).exists():
+        pytest.skip("the plugin is not in this tree")
     assert case.run_file.is_file()
+    assert case.algorithm in PEER_NAMES
+
+
+def test_result_files_tell_case_side_and_seed() -> None:
+    entry = Entry(Case("sac", "pendulum", 20_000, 3), "peer", 2)
+    assert entry.name == "pendulum_sac-20000-peer-2"
+
+
+def without(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """Takes trainers away, as if their plugins were not installed."""
+    found = learning.load_registries()
+    left = {k: v for k, v in found.trainers.entries.items() if k not in names}
+    fewer = replace(found, trainers=replace(found.trainers, entries=left))
+    monkeypatch.setattr(learning, "load_registries", lambda: fewer)
+
+
+def test_an_algorithm_that_is_not_installed_is_left_out_or_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    without(monkeypatch, "sac")
+    install = "pip install -e examples/ventosa-sac-plugin"
+    assert learning.trainable(None) == {"ppo", "trpo", "ddpg"}
+    assert install in capsys.readouterr().out
+    assert learning.trainable(["ppo"]) == {"ppo"}
+    assert not capsys.readouterr().out
+    assert learning.main(["--algorithms", "sac", "ppo"]) == 2
+    assert install in capsys.readouterr().err
+
+
+def test_the_command_reports_on_what_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- learning -->\nold\n<!-- end of learning -->\nafter\n")
+    for one in RESULTS:
+        case = Case("ppo", "pendulum", 100_000)
+        file = tmp_path / f"{Entry(case, one['side'], one['seed']).name}.json"
+        file.write_text(json.dumps(one))
+    chosen = ["--algorithms", "ppo", "--tasks", "pendulum", "--seeds", "0", "1", "2"]
+    written = ["--results", str(tmp_path), "--page", str(page), "--pictures", str(tmp_path / "new")]
+    assert learning.main([*chosen, *written]) == 0
+    assert "-160 ± 25" in capsys.readouterr().out
+    text = page.read_text()
+    assert text.startswith("before\n<!-- learning -->\n| task |")
+    assert "| pendulum | 1,000 | ppo | 3 | -160 ± 25 | -170 ± 25 | 333 | 333 |" in text
+    assert text.endswith("<!-- end of learning -->\nafter\n")
+    assert (tmp_path / "new" / "learning_ppo.png").stat().st_size > 1000
+
+
+def test_the_peer_of_a_plugin_is_found_by_its_name_and_takes_its_settings() -> None:
+    pytest.importorskip("stable_baselines3")
+    pytest.importorskip("sb3_contrib")
+    from benchmarks.learning.theirs import build
+    from benchmarks.peers import PeerVecEnv
+
+    hyper = SimpleNamespace(
+        batch_size=64, buffer_size=1000, buffer_init_steps=10, learning_rate=3e-4, gamma=0.97
+    )
+    hyper.tau, hyper.updates_per_step, hyper.init_entropy_coefficient = 0.01, 0.5, 0.25
+    networks = NetworkSettings(hidden_units=32, num_layers=1, activation="tanh")
+    settings = SimpleNamespace(hyperparameters=hyper, network_settings=networks)
+    run: Any = SimpleNamespace(trainer=Component("sac", object, settings), seed=3)  # type: ignore[arg-type]
+    env = Counting()
+    env.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
+    model: Any = build(run, PeerVecEnv(env))
+    assert type(model).__name__ == "SAC"
+    assert (model.batch_size, model.buffer_size, model.learning_starts) == (64, 1000, 10)
+    assert (model.learning_rate, model.gamma, model.tau) == (3e-4, 0.97, 0.01)
+    assert (model.gradient_steps, model.train_freq.frequency) == (1, 1)  # half of two environments
+    assert model.log_ent_coef.exp().item() == pytest.approx(0.25)  # learned, from there
+    assert "Tanh" in repr(model.actor)
+    assert "out_features=32" in repr(model.critic)
 
 
 def test_the_peers_side_learns(tmp_path: Path) -> None:

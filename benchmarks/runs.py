@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
@@ -26,6 +27,13 @@ class Job:
     name: str
     commands: Sequence[Sequence[str]]
     results: Path
+
+
+def add_options(parser: argparse.ArgumentParser, results: str) -> None:
+    """Adds the options of a command that runs jobs and reports on them."""
+    parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), help="at a time")
+    parser.add_argument("--results", type=Path, default=Path(results), metavar="DIR")
+    parser.add_argument("--page", type=Path, metavar="FILE", help="write the table as Markdown")
 
 
 def run_missing(jobs: Sequence[Job], at_once: int) -> int:
