@@ -1,6 +1,6 @@
 """What a whole training process costs: memory, and the time until it is under way.
 
-Each is measured in a process of its own, which this module is the main of.
+Each is measured in a process of its own, which loads nothing but what it needs.
 """
 
 from __future__ import annotations
@@ -9,46 +9,26 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from benchmarks.speed.figures import MODES, OURS
-from benchmarks.speed.setup import Setup
+from benchmarks.runs import ROOT
 
-REPOSITORY = Path(__file__).parents[2]
-RUN_FILE = REPOSITORY / "config" / "run.yaml"
+RUN_FILE = ROOT / "config" / "run.yaml"
 BUFFERS = 2
 KIB_PER_MIB = 1024
 
 
-@dataclass(frozen=True)
-class Footprint:
-    """The most memory a training process had resident.
+def peak_mib(contender: str, size: int, mode: str, num_envs: int) -> float:
+    """The most memory that a contender has resident while it trains on `BUFFERS` buffers, in MiB.
 
-    Attributes:
-        contender: who trained.
+    Args:
+        contender: one of `benchmarks.speed.training.contenders`.
         size: side of the images in pixels.
         mode: one of `benchmarks.speed.figures.MODES`.
-        peak_mib: peak resident set in MiB.
+        num_envs: environments stepped together.
     """
-
-    contender: str
-    size: int
-    mode: str
-    peak_mib: float
-
-
-def footprints(
-    setup: Setup, contenders: Sequence[str], modes: Iterable[str] = tuple(MODES)
-) -> list[Footprint]:
-    """Measures the peak resident set of each contender, over `BUFFERS` buffers."""
-    found = []
-    for mode in modes:
-        for name in contenders:
-            peak_mib = _ask("learn", name, str(setup.size), mode, str(setup.num_envs))
-            found.append(Footprint(name, setup.size, mode, peak_mib))
-    return found
+    return _ask("own_peak_mib", contender, size, mode, num_envs)
 
 
 def start_s() -> float:
@@ -58,31 +38,27 @@ def start_s() -> float:
     """
     for _ in range(2):
         begun_s = time.monotonic()
-        first_step_s = _ask("start")
+        first_step_s = _ask("first_step_time_s")
     return first_step_s - begun_s
 
 
-def _ask(*arguments: str) -> float:
-    """The number that such a process prints last."""
+def _ask(function: str, *arguments: Any) -> float:
+    """What a function of this module returns in a process of its own."""
+    call = f"import {__name__} as here; print(here.{function}(*{arguments!r}))"
     process = subprocess.run(
-        [sys.executable, "-m", __name__, *arguments],
-        capture_output=True,
-        cwd=REPOSITORY,
-        text=True,
-        check=False,
+        [sys.executable, "-c", call], capture_output=True, cwd=ROOT, text=True, check=False
     )
     if process.returncode != 0:
-        raise RuntimeError(f"measuring {' '.join(arguments)!r} failed:\n{process.stderr}")
+        raise RuntimeError(f"measuring {function}{arguments} failed:\n{process.stderr}")
     return float(process.stdout.split()[-1])
 
 
-def _learn(name: str, size: int, mode: str, num_envs: int) -> float:
-    """Trains for a while; returns the peak resident set of this process in MiB."""
-    # Each process loads its own contender alone.
-    from benchmarks.speed.training import contenders  # noqa: PLC0415
+def own_peak_mib(name: str, size: int, mode: str, num_envs: int) -> float:
+    """The same of this process."""
+    from benchmarks.speed.figures import OURS  # noqa: PLC0415
+    from benchmarks.speed.training import contenders, load  # noqa: PLC0415
 
-    setup = Setup(size=size, mode=mode, num_envs=num_envs)
-    contender = contenders(peer=name != OURS)[name](setup)
+    contender = contenders(peer=name != OURS)[name](load(size, mode, num_envs))
     for _ in range(BUFFERS):
         contender.learn()
     contender.close()
@@ -109,11 +85,3 @@ def first_step_time_s() -> float:
         )
         run_file(options, after_one_step)
     return asked_s[-1]
-
-
-if __name__ == "__main__":
-    match sys.argv[1:]:
-        case ["learn", name, size, mode, num_envs]:
-            print(_learn(name, int(size), mode, int(num_envs)))
-        case _:
-            print(first_step_time_s())

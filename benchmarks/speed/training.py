@@ -5,17 +5,33 @@ Both act in the same batched environment, with the same network, hyper-parameter
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
-from dataclasses import replace
+from contextlib import ExitStack, closing
 from functools import partial
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
-from benchmarks.speed.figures import MODES, OURS, PEER, Case, Figure
-from benchmarks.speed.setup import Setup
-from benchmarks.speed.timing import Samples, interleave
-from benchmarks.speed.ventosa import Ventosa
+from rich.console import Console
+
+from benchmarks.speed.figures import MODES, OURS, PEER, Figures, race
+from trainers.algorithms.ppo import PPOSettings
 from trainers.common.timers import Timer, recording
+from trainers.reporting.event_log import RunLog
+from trainers.reporting.summary import Summary
+from trainers.reporting.terminal import make_display
+from trainers.runfile.registry import load_registries
+from trainers.runfile.settings import RunSettings, load_run
+from trainers.saving.checkpoint import Checkpoints
+from trainers.session import Session
+from trainers.training import train
+
+RUN_FILE = Path(__file__).with_name("training.yaml")
+BUFFER_STEPS = 32
+"""Of each environment between two updates."""
+
+PEER_PACKAGES = ("stable_baselines3", "sb3_contrib")
+"""What the peer is in, of the extra `bench`."""
 
 WHATS = {
     "collection steps": "collect",
@@ -41,28 +57,74 @@ class Contender(Protocol):
         """Ends the environments."""
 
 
-def contenders(peer: bool) -> dict[str, Callable[[Setup], Contender]]:
+Makers = Mapping[str, Callable[[RunSettings], Contender]]
+
+
+def load(size: int, mode: str, num_envs: int) -> RunSettings:
+    """The run of both contenders, with images of a size in pixels and one of `MODES`."""
+    camera = "environment.cameras.depth"
+    overrides = {
+        "environment.num_envs": num_envs,
+        "environment.frame_grab": str(MODES[mode]).lower(),
+        f"{camera}.width": size,
+        f"{camera}.height": size,
+        "encoders.depth.size": size,
+        "trainer.hyperparameters.buffer_size": BUFFER_STEPS * num_envs,
+    }
+    lines = [f"{key}={value}" for key, value in overrides.items()]
+    return load_run(RUN_FILE, lines, load_registries())
+
+
+class Ventosa:
+    """Trains as `trainers.learn` does, summaries included; only checkpoints are left out."""
+
+    def __init__(self, run: RunSettings):
+        self._settings: PPOSettings = run.trainer.settings  # type: ignore[assignment]
+        with ExitStack() as stack:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            self.session = stack.enter_context(closing(Session(run, load_registries())))
+            log = stack.enter_context(closing(RunLog(folder)))
+            self.session.reset()
+            self._summary = Summary(log, "speed", 1, self._settings.summary_freq)
+            self._checkpoints = _NoCheckpoints(folder, 1)
+            self._display = make_display("speed", 1, 1, console=Console(quiet=True))
+            self.close = stack.pop_all().close
+        self.parameters = sum(p.numel() for p in self.session.algorithm.policy.parameters())
+
+    def learn(self) -> None:
+        """See `Contender`."""
+        steps = self.session.env_runner.step_count + self._settings.hyperparameters.buffer_size
+        settings = self._settings.model_copy(update={"max_steps": steps})
+        train(self.session, settings, self._summary, self._checkpoints, self._display)
+
+
+class _NoCheckpoints(Checkpoints):
+    """Where nothing is saved, as the peer saves nothing."""
+
+    def save(self, *_: Any, **__: Any) -> Path:
+        return Path()
+
+
+def contenders(peer: bool) -> Makers:
     """What is compared: this project's trainer and, where it is installed, its peer."""
-    chosen: dict[str, Callable[[Setup], Contender]] = {OURS: Ventosa}
-    if peer:
-        # Imported late, for it needs the extra `bench`.
-        from benchmarks.speed.stable_baselines import StableBaselines  # noqa: PLC0415
+    if not peer:
+        return {OURS: Ventosa}
+    # Imported late, for it needs the extra `bench`.
+    from benchmarks.speed.stable_baselines import StableBaselines  # noqa: PLC0415
 
-        chosen[PEER] = StableBaselines
-    return chosen
+    return {OURS: Ventosa, PEER: StableBaselines}
 
 
-def measure(
-    setup: Setup,
-    repeats: int,
-    seconds: float,
-    makers: Mapping[str, Callable[[Setup], Contender]],
-) -> tuple[list[Figure], int]:
+def training(
+    mode: str, size: int, num_envs: int, rounds: int, seconds: float, makers: Makers
+) -> tuple[Figures, int]:
     """Measures the training loops.
 
     Args:
-        setup: what all have in common; the mode is set here.
-        repeats: rounds.
+        mode: one of `MODES`.
+        size: side of the images in pixels.
+        num_envs: environments stepped together.
+        rounds: of measurements in turn.
         seconds: of each measurement, rounded up to whole buffers.
         makers: build the contenders.
 
@@ -72,33 +134,19 @@ def measure(
     Raises:
         RuntimeError: the contenders differ in that.
     """
-    figures, parameters = [], 0
-    for mode in MODES:
-        with ExitStack() as stack:
-            teams = {}
-            for name, make in makers.items():
-                teams[name] = make(replace(setup, mode=mode))
-                stack.callback(teams[name].close)
-            parameters = _common_parameters(teams)
-            for team in teams.values():
-                team.learn()  # compiles, and takes what memory it needs
-            measures = {
-                name: partial(_speeds, team, setup.buffer_size, seconds)
-                for name, team in teams.items()
-            }
-            found = interleave(measures, repeats)
-        for name, rounds in found.items():
-            for what in WHATS:
-                case = Case(what, setup.size, mode, setup.num_envs)
-                figures.append(Figure(case, name, Samples(tuple(one[what] for one in rounds))))
-    return figures, parameters
-
-
-def _common_parameters(teams: Mapping[str, Contender]) -> int:
-    counts = {name: one.parameters for name, one in teams.items()}
-    if len(set(counts.values())) > 1:
-        raise RuntimeError(f"the networks differ in their numbers of parameters: {counts}")
-    return next(iter(counts.values()))
+    run = load(size, mode, num_envs)
+    with ExitStack() as stack:
+        teams = {name: stack.enter_context(closing(make(run))) for name, make in makers.items()}
+        parameters = {name: one.parameters for name, one in teams.items()}
+        if len(set(parameters.values())) > 1:
+            raise RuntimeError(f"the networks differ in their numbers of parameters: {parameters}")
+        for one in teams.values():
+            one.learn()  # compiles, and takes what memory it needs
+        measures = {
+            (name, num_envs): partial(_speeds, one, BUFFER_STEPS * num_envs, seconds)
+            for name, one in teams.items()
+        }
+        return race(measures, size, mode, rounds), next(iter(parameters.values()))
 
 
 def _speeds(contender: Contender, buffer_size: int, seconds: float) -> dict[str, float]:

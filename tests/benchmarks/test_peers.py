@@ -17,9 +17,9 @@ from envs.environment import Environment
 pytest.importorskip("stable_baselines3")
 
 from benchmarks.peers import PeerVecEnv
-from benchmarks.speed.setup import Setup
+from benchmarks.speed.figures import FRAME_GRAB
 from benchmarks.speed.stable_baselines import StableBaselines
-from benchmarks.speed.ventosa import Ventosa
+from benchmarks.speed.training import Ventosa, load
 from trainers.networks.actor_critic import ActorCritic
 from trainers.networks.observations import Observations
 
@@ -157,12 +157,12 @@ def test_the_environments_are_one_object() -> None:
     assert source.closed_times == 1
 
 
-@pytest.mark.parametrize("size", [32, 80])
+@pytest.mark.parametrize("size", [32, 80, 128])
 def test_both_networks_compute_the_same(size: int) -> None:
-    setup = Setup(size=size, num_envs=2, batch_size=64)
-    ours, peer = Ventosa(setup), StableBaselines(setup)
+    run = load(size, FRAME_GRAB, 16)
+    ours, peer = Ventosa(run), StableBaselines(run)
     try:
-        policy, theirs = ours._session.algorithm.policy, peer._ppo.policy
+        policy, theirs = ours.session.algorithm.policy, peer.model.policy
         assert isinstance(policy, ActorCritic)
         assert ours.parameters == peer.parameters
         _copy(theirs.features_extractor, [policy.actor.frame_encoders, policy.actor.trunk])

@@ -1,55 +1,108 @@
+"""How figures are taken, by a clock that goes on only when it is told to."""
+
 from __future__ import annotations
 
 import pytest
 
-from benchmarks.speed.figures import FAST, OURS, PEER, PYBULLET, Case, Figure, growth, speedup
-from benchmarks.speed.figures import by_case as group
-from benchmarks.speed.timing import Samples
+from benchmarks.speed.figures import (
+    FAST,
+    OURS,
+    PEER,
+    PYBULLET,
+    Case,
+    Figures,
+    Samples,
+    growth,
+    race,
+    rate,
+    speedup,
+)
 
 
-def figure(contender: str, *rates: float, num_envs: int = 64, mode: str = "stream") -> Figure:
-    return Figure(Case("steps", 80, mode, num_envs), contender, Samples(rates))
+class Clock:
+    """Goes on only when it is told to."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+    def spend(self, seconds: float) -> None:
+        self.now_s += seconds
 
 
-def test_figures_of_one_case_stand_side_by_side() -> None:
-    fast, slow, more = figure(FAST, 3.0), figure(PYBULLET, 1.0), figure(FAST, 9.0, num_envs=256)
-    cases = group([fast, slow, more])
-    assert list(cases.values()) == [{FAST: fast, PYBULLET: slow}, {FAST: more}]
+def test_samples_are_told_by_median_and_range() -> None:
+    assert Samples((5.0, 1.0, 2.0)).spread == (2.0, 1.0, 5.0)
+    assert Samples((1.0, 2.0, 4.0, 9.0)).spread[0] == 3.0
+    assert str(Samples((1.5, 0.25, 2.0))) == "1.50 (0.25 to 2.00)"
+    assert str(Samples((99.0, 1000.0, 2500.0))) == "1,000 (99 to 2,500)"
+
+
+def test_a_ratio_is_taken_within_each_round() -> None:
+    # The second round was slow for both: the ratio does not notice.
+    ratio = Samples((10.0, 1.0, 12.0)) / Samples((5.0, 0.5, 4.0))
+    assert ratio.values == (2.0, 2.0, 3.0)
+    with pytest.raises(ValueError, match="shorter"):
+        Samples((1.0, 2.0)) / Samples((1.0,))
+
+
+def test_contenders_take_turns_and_stand_side_by_side() -> None:
+    calls: list[str] = []
+
+    def measure(name: str) -> dict[str, float]:
+        calls.append(name)
+        return {"steps": float(len(calls)), "updates": 7.0}
+
+    teams = {("a", 64): "a", ("b", 64): "b", ("a", 256): "c"}
+    measures = {team: lambda name=name: measure(name) for team, name in teams.items()}
+    found = race(measures, 80, "stream", rounds=2)
+    assert calls == ["a", "b", "c", "a", "b", "c"]
+    assert found[Case("steps", 80, "stream", 64)] == {
+        "a": Samples((1.0, 4.0)),
+        "b": Samples((2.0, 5.0)),
+    }
+    assert found[Case("steps", 80, "stream", 256)] == {"a": Samples((3.0, 6.0))}
+    assert found[Case("updates", 80, "stream", 64)]["b"] == Samples((7.0, 7.0))
+
+
+def test_a_rate_is_work_over_the_time_it_took_and_preparation_does_not_count() -> None:
+    clock = Clock()
+
+    def work() -> int:
+        clock.spend(0.4)
+        return 10
+
+    # Three times, because twice are only 0.8 s.
+    speed = rate(work, 1.0, prepare=lambda: clock.spend(7.0), clock=clock)
+    assert speed == pytest.approx(30 / 1.2)
+    assert clock.now_s == pytest.approx(100.0 + 3 * 7.4)
+
+
+def test_work_is_done_once_at_least() -> None:
+    clock = Clock()
+
+    def work() -> int:
+        clock.spend(2.0)
+        return 4
+
+    assert rate(work, 0.0, clock=clock) == pytest.approx(2.0)
 
 
 def test_each_is_compared_with_its_own_rival() -> None:
-    faster = speedup({FAST: figure(FAST, 8.0, 9.0), PYBULLET: figure(PYBULLET, 4.0, 3.0)})
-    assert faster is not None
-    assert faster.values == (2.0, 3.0)
-    ours = speedup({PEER: figure(PEER, 4.0), OURS: figure(OURS, 2.0)})
-    assert ours is not None
-    assert ours.values == (0.5,)
-    assert speedup({FAST: figure(FAST, 8.0), PEER: figure(PEER, 4.0)}) is None
+    a, b = Samples((8.0, 9.0)), Samples((4.0, 3.0))
+    assert speedup({FAST: a, PYBULLET: b}) == Samples((2.0, 3.0))
+    assert speedup({PEER: a, OURS: b}) == Samples((0.5, 1 / 3))
+    assert speedup({FAST: a, PEER: b}) is None
 
 
-def test_growth_in_proportion_has_exponent_one() -> None:
-    # 64 environments in 2 ms, 256 in 8 ms, 1024 in 32 ms: always 32,000 steps per second.
-    figures = [figure(FAST, 32_000.0, num_envs=n) for n in (64, 256, 1024)]
-    (found,) = growth(figures)
-    assert found.step_s == pytest.approx({64: 0.002, 256: 0.008, 1024: 0.032})
-    assert found.exponent == pytest.approx(1.0)
+def step_times(mode: str, times_s: dict[int, float]) -> Figures:
+    return {Case("steps", 80, mode, n): {FAST: Samples((n / s,))} for n, s in times_s.items()}
 
 
-def test_a_step_that_takes_twice_the_time_for_four_times_as_many_has_exponent_one_half() -> None:
-    figures = [figure(FAST, 64 / 0.001), figure(FAST, 256 / 0.002, num_envs=256)]
-    (found,) = growth([*figures, figure(FAST, 1.0, mode="frame grab")])
-    assert (found.mode, found.size) == ("stream", 80)
-    assert found.exponent == pytest.approx(0.5)
-
-
-def test_json_has_the_median_and_every_round() -> None:
-    assert figure(FAST, 1.0, 3.0, 2.0).plain() == {
-        "what": "steps",
-        "size": 80,
-        "mode": "stream",
-        "num_envs": 64,
-        "contender": FAST,
-        "per_second": 2.0,
-        "range": [1.0, 3.0],
-        "samples": [1.0, 3.0, 2.0],
-    }
+def test_growth_is_the_exponent_of_the_time_of_a_step() -> None:
+    in_proportion = step_times("stream", {64: 0.002, 256: 0.008, 1024: 0.032})
+    by_half = step_times("frame grab", {64: 0.001, 256: 0.002})
+    found = growth(in_proportion | by_half)
+    assert found == pytest.approx({(80, "stream"): 1.0, (80, "frame grab"): 0.5})
+    assert growth(step_times("stream", {64: 0.001})) == {}
