@@ -4,6 +4,10 @@ Simulators and environments are compared with PyBullet's, the training loop with
 PPO on the same environment. All are measured in turn in one run: the median over the rounds counts,
 and the slowest and the fastest round are shown beside it. All of it takes about an hour, most of
 which is training on the largest images; `--sizes 80` takes minutes.
+
+With `--track FILE` a fixed set is measured instead, in some two minutes, and added to the file as
+one line of JSON. What fell by more than 10 % since the last line of a like machine is said, and the
+exit code is 1 if that is a ratio to a peer; speeds alone move with whatever else a machine does.
 """
 
 from __future__ import annotations
@@ -11,10 +15,11 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
+from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.command import INSTALL, missing, tells_mistakes
+from benchmarks.command import INSTALL, missing, require, tells_mistakes
 
 PARTS = ("simulator", "environment", "training", "memory")
 SIZES = (32, 80, 128, 256)
@@ -24,13 +29,17 @@ MIN_ENVS = 16
 
 @tells_mistakes
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures, and prints tables."""
+    """Measures, and prints tables or tracks a history."""
     options = parse(arguments)
     # As `trainers.learn` has it, and before torch is imported: idle threads wait, and don't spin.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from benchmarks.speed.parts import PARTS as MEASURES  # noqa: PLC0415
+    from benchmarks.speed.track import track  # noqa: PLC0415
     from benchmarks.speed.training import PEER_PACKAGES  # noqa: PLC0415
 
+    if options.track is not None:
+        require(*PEER_PACKAGES)
+        return track(options.track)
     if missing(*PEER_PACKAGES) and {"training", "memory"} & set(options.parts):
         print(f"stable-baselines3 is not installed, training is measured without it; {INSTALL}")
     for part in options.parts:
@@ -56,6 +65,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--repeats", type=int, default=3, help="rounds, of which the median counts")
     parser.add_argument("--seconds", type=float, default=2.0, help="of a measurement, at least")
+    parser.add_argument("--track", type=Path, metavar="FILE", help="add a line to this history")
     options = parser.parse_args(arguments)
     for name, least in (("num_envs", MIN_ENVS), ("repeats", 1)):
         if getattr(options, name) < least:
