@@ -78,12 +78,15 @@ class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
 
     Attributes:
         Settings: the model of the run file's `environment` section.
+        snapshot: the type of what its rewards are computed from; its constructor gives the rewards
+            to `rewards.reward.fitting`, which refuses those for another one.
         parameter_names: the environment parameters that curricula and samplers may set.
         privileged: names of the observations that only a critic may see.
         evaluation_episodes: how many an evaluation plays unless it is told otherwise.
     """
 
     Settings: ClassVar[type[BaseModel]]
+    snapshot: ClassVar[type] = object
     parameter_names: ClassVar[frozenset[str]] = frozenset()
     privileged: frozenset[str] = frozenset()
     evaluation_episodes: ClassVar[int] = 100
@@ -91,7 +94,7 @@ class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     @abstractmethod
-    def __init__(self, settings: BaseModel, rewards: Sequence[RewardTerm], seed: int):
+    def __init__(self, settings: BaseModel, rewards: Sequence[RewardTerm[Any]], seed: int):
         """Builds N environments.
 
         Raises:

@@ -33,8 +33,9 @@ def ventosa_encoders() -> dict[str, type]:  # type: ignore[empty-body]
 def ventosa_rewards() -> dict[str, type]:  # type: ignore[empty-body]
     """Offer rewards: name -> class whose instances are callable.
 
-    It is built as `cls(settings)`, and maps a `rewards.grasp.transition.GraspTransition` of N
-    environments to an array (N,) of floats. The environment applies the run file's weight.
+    It is built as `cls(settings)`, and maps the environment's snapshot of N transitions, whose type
+    it declares in `snapshot`, to an array (N,) of floats. The environment applies the run file's
+    weight.
     """
 
 

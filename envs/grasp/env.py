@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from envs.grasp.settings import GraspSettings
 from envs.grasp.vector_env import GraspVectorEnv
+from rewards.grasp.transition import GraspTransition
 from rewards.plugin import ventosa_rewards
-from rewards.reward import RewardTerm
+from rewards.reward import RewardTerm, fits
 
 DEFAULT_REWARDS = dict.fromkeys(
     ("touch", "collision", "position", "rotation", "approach", "facing"), 1.0
@@ -38,7 +39,7 @@ def make_vector_env(
     Raises:
         ValueError: a setting or a reward that does not exist, or does not fit.
     """
-    built_in = ventosa_rewards()
+    built_in = {k: cls for k, cls in ventosa_rewards().items() if fits(cls, GraspTransition)}
     if unknown := sorted(set(rewards) - set(built_in)):
         raise ValueError(f"unknown rewards {unknown}; there are {sorted(built_in)}")
     terms = [

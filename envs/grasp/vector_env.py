@@ -27,7 +27,7 @@ from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.factory import make_simulator
 from envs.grasp.task import Arm, EpisodeProgress, GoalRegion, Motion, advance, goal_middle_m, judge
 from rewards.grasp.transition import GraspTransition
-from rewards.reward import RewardTerm, weigh
+from rewards.reward import RewardTerm, fitting, weigh
 
 GOAL_PARAMETERS = ("lateral_limit_m", "vertical_limit_m", "gap_limit_m", "yaw_limit_deg")
 
@@ -47,6 +47,7 @@ class GraspVectorEnv(Environment):
     """
 
     Settings = GraspSettings
+    snapshot: ClassVar[type[GraspTransition]] = GraspTransition
     parameter_names: ClassVar[frozenset[str]] = frozenset(
         {*GOAL_PARAMETERS, "noise_sigma_m", "block_yaw_limit_deg"}
     )
@@ -60,11 +61,12 @@ class GraspVectorEnv(Environment):
     def __init__(
         self,
         settings: GraspSettings,
-        rewards: Sequence[RewardTerm],
+        rewards: Sequence[RewardTerm[Any]],
         seed: int = 0,
         render_mode: str | None = None,
     ):
-        self._settings, self._rewards, self.render_mode = settings, tuple(rewards), render_mode
+        self._settings, self.render_mode = settings, render_mode
+        self._rewards = fitting(rewards, self.snapshot)
         self.num_envs = settings.num_envs
         self.single_action_space = Box(-1.0, 1.0, (4,), np.float32)
         self.single_observation_space = observation_space(settings)
@@ -113,7 +115,7 @@ class GraspVectorEnv(Environment):
                 f"with {np.count_nonzero(~np.isfinite(actions))} values that are not finite"
             )
         transition = self._move(actions)
-        terms = weigh(self._rewards, transition)
+        terms = weigh(self._rewards, transition, self.num_envs)
         terminated = transition.rotation_right
         steps = self._running().progress.steps
         truncated = ~terminated & (steps >= self._settings.episode_steps)

@@ -1,5 +1,7 @@
 """Rewards paid when something happens (the paper's section "Rewards design" and its baseline)."""
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, FiniteFloat
@@ -9,6 +11,8 @@ from rewards.grasp.transition import Bools, GraspTransition
 
 class Touch:
     """Paid the first time in an episode that the cup touches the target block."""
+
+    snapshot: ClassVar[type] = GraspTransition
 
     class Settings(BaseModel, frozen=True, extra="forbid"):
         """Settings of the reward `touch`."""
@@ -28,6 +32,8 @@ class Touch:
 class Collision:
     """A punishment for every step with an undesired contact."""
 
+    snapshot: ClassVar[type] = GraspTransition
+
     class Settings(BaseModel, frozen=True, extra="forbid"):
         """Settings of the reward `collision`."""
 
@@ -45,6 +51,8 @@ class Collision:
 
 class Position:
     """Paid the first time in an episode that the tooltip is inside the goal region."""
+
+    snapshot: ClassVar[type] = GraspTransition
 
     class Settings(BaseModel, frozen=True, extra="forbid"):
         """Settings of the reward `position`."""
@@ -65,6 +73,8 @@ class Position:
 
 class Rotation:
     """Paid the first time in an episode that rotation and position are both right."""
+
+    snapshot: ClassVar[type] = GraspTransition
 
     class Settings(BaseModel, frozen=True, extra="forbid"):
         """Settings of the reward `rotation`."""

@@ -1,6 +1,6 @@
 """Rewards paid at every step, which tell how well an action went (the paper's "Rewards design")."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ class Approach:
     with `per_step` no closed path earns anything. With `per_second` that holds as long as all
     motions take the same time.
     """
+
+    snapshot: ClassVar[type] = GraspTransition
 
     class Settings(BaseModel, frozen=True, extra="forbid"):
         """Settings of the reward `approach`."""
@@ -51,6 +53,8 @@ class Facing:
     Positive when the tool looks at the face, which is when its axis is opposite to the normal.
     """
 
+    snapshot: ClassVar[type] = GraspTransition
+
     class Settings(BaseModel, frozen=True, extra="forbid"):
         """Settings of the reward `facing`."""
 
@@ -76,6 +80,8 @@ class Precision:
     away than its own width the logarithm is convex (wider noise pays), nearer it is concave
     (narrower noise does).
     """
+
+    snapshot: ClassVar[type] = GraspTransition
 
     class Settings(BaseModel, frozen=True, extra="forbid"):
         """Settings of the reward `precision`."""

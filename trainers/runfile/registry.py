@@ -232,7 +232,10 @@ def reward_breach(cls: type) -> str | None:
     """Say how a reward breaks its contract, or None."""
     # Not `cls.__call__`: that is the metaclass's, which every class has.
     defined = any("__call__" in vars(base) for base in cls.__mro__)
-    return None if defined else f"{cls.__name__} is not callable: it has no method __call__"
+    if not defined:
+        return f"{cls.__name__} is not callable: it has no method __call__"
+    declared = getattr(cls, "snapshot", object)
+    return None if isinstance(declared, type) else f"{cls.__name__}.snapshot is not a class"
 
 
 def curriculum_breach(cls: type) -> str | None:

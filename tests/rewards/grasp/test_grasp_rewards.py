@@ -11,8 +11,9 @@ from pydantic import ValidationError
 
 from rewards.grasp.transition import GraspTransition
 from rewards.plugin import ventosa_rewards
+from rewards.reward import fits
 
-REWARDS = ventosa_rewards()
+REWARDS = {k: cls for k, cls in ventosa_rewards().items() if fits(cls, GraspTransition)}
 
 
 def make(name, **settings):
