@@ -2,6 +2,7 @@
 
 from rewards.grasp.events import Collision, Position, Rotation, Sparse, Touch
 from rewards.grasp.shaping import Approach, Facing, Precision
+from rewards.gym.environment import EnvironmentReward
 from trainers.hookspecs import hookimpl
 
 
@@ -17,4 +18,5 @@ def ventosa_rewards() -> dict[str, type]:
         "facing": Facing,
         "precision": Precision,
         "sparse": Sparse,
+        "environment": EnvironmentReward,
     }

@@ -8,6 +8,7 @@ it again.
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import gymnasium
@@ -25,19 +26,24 @@ def episode_seed(run_seed: int, index: int, episode: int) -> int:
 class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
     """One of a run's environments; seeds each of its episodes.
 
-    Its infos stay empty: to gather those of many environments takes longer than many a step, and
-    nobody reads them.
+    An environment may use an array again that it has handed out, so what an episode ended with is
+    copied before the next one begins.
 
     Args:
         env: the environment.
         run_seed: of the run.
         index: which of the run's environments it is, from 0.
+        with_infos: pass on the infos of steps. Otherwise they are empty: to gather those of many
+            environments takes longer than many a step.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], run_seed: int, index: int):
+    def __init__(
+        self, env: gymnasium.Env[Any, Any], run_seed: int, index: int, *, with_infos: bool = False
+    ):
         super().__init__(env)
-        self._run_seed, self._index = run_seed, index
+        self._run_seed, self._index, self._with_infos = run_seed, index, with_infos
         self._begun = 0
+        self._last_info: dict[str, Any] = {}
 
     def count_from(self, run_seed: int, begun: NDArray[np.int64]) -> None:
         """Goes to where some episodes had begun.
@@ -51,16 +57,26 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins the next episode, with its own seed whatever `seed` is."""
+        """Begins the next episode, with its own seed whatever `seed` is.
+
+        The info is that of the step which ended the episode before, for gymnasium resets within a
+        step, and gathers then what a reset says.
+        """
         own = episode_seed(self._run_seed, self._index, self._begun)
         self._begun += 1
         observation, _ = self.env.reset(seed=own, options=options)
-        return observation, {}
+        info, self._last_info = self._last_info, {}
+        return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Steps the environment."""
-        observation, reward, terminated, truncated, _ = self.env.step(action)
-        return observation, reward, terminated, truncated, {}
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if not self._with_infos:
+            info = {}
+        if terminated or truncated:
+            observation, info = copy.deepcopy((observation, info))
+            self._last_info = info
+        return observation, reward, terminated, truncated, info
 
     def play(self, lengths: NDArray[np.int64], actions: NDArray[Any]) -> Any:
         """Plays an episode from its beginning; returns the last observation.
@@ -70,6 +86,6 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
             actions: (T, N, ...) the last T steps' actions, T being the greatest length.
         """
         observation, _ = self.reset()
-        for action in actions[len(actions) - lengths[self._index] :, self._index]:
+        for action in actions[len(actions) - lengths[self._index] :, self._index].copy():
             observation, *_ = self.env.step(action)
         return observation

@@ -19,17 +19,20 @@ EXTRAS = {"gymnasium.envs.mujoco": "mujoco", "gymnasium.envs.box2d": "box2d"}
 """Packages of environments -> our optional dependencies that they need."""
 
 
-def make_vector_env(settings: GymSettings, seed: int) -> GymVectorEnv:
+def make_vector_env(settings: GymSettings, seed: int, *, with_infos: bool) -> GymVectorEnv:
     """Makes N environments that are stepped together and reset in the step an episode ends in.
 
     Args:
         settings: which, and how many.
         seed: of all their episodes.
+        with_infos: see `RepeatableEpisodes`.
 
     Raises:
         ValueError: it does not exist, lacks a package, or refuses its arguments.
     """
-    makers = [partial(_make_one, settings, seed, index) for index in range(settings.num_envs)]
+    makers = [
+        partial(_make_one, settings, seed, index, with_infos) for index in range(settings.num_envs)
+    ]
     vectorize = SyncVectorEnv if settings.vectorization == "sync" else AsyncVectorEnv
     # Whoever reads the observations copies them anyway.
     return vectorize(makers, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
@@ -58,12 +61,14 @@ def make(settings: GymSettings) -> gymnasium.Env[Any, Any]:
     return env
 
 
-def _make_one(settings: GymSettings, seed: int, index: int) -> gymnasium.Env[Any, Any]:
+def _make_one(
+    settings: GymSettings, seed: int, index: int, with_infos: bool
+) -> gymnasium.Env[Any, Any]:
     if multiprocessing.parent_process() is not None:
         # A process of its own: Ctrl-C is for the learner, which ends its environments.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    return RepeatableEpisodes(make(settings), seed, index)
+    return RepeatableEpisodes(make(settings), seed, index, with_infos=with_infos)
 
 
 def _nearest(name: str) -> str:

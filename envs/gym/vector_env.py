@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
@@ -14,13 +14,17 @@ from envs.environment import Environment, EnvironmentFailure, Observations, Step
 from envs.gym.making import make_vector_env
 from envs.gym.settings import GymSettings
 from envs.gym.spaces import ActionAdapter, ObservationAdapter
-from rewards.reward import RewardTerm
+from rewards.gym.transition import GymTransition
+from rewards.reward import RewardTerm, fitting, weigh
+
+ADDED_INFOS = ("final_obs", "_final_obs", "final_info", "_final_info")
+"""What gymnasium itself adds to the infos of a step in which an episode ends."""
 
 _logger = logging.getLogger("ventosa")
 
 
 class GymEnvironment(Environment):
-    """N environments of gymnasium, with their own rewards. See `Environment`.
+    """N environments of gymnasium. See `Environment`.
 
     A state to go on from is the number of each environment's episode, which gives its seed, and its
     actions so far: what happened is played again. That is exact where an environment draws
@@ -29,7 +33,7 @@ class GymEnvironment(Environment):
 
     Args:
         settings: which environment.
-        rewards: none; they are the environment's affair.
+        rewards: the terms whose weighted sum is the reward; none: it is the environment's own.
         seed: of everything that is drawn.
 
     Raises:
@@ -37,17 +41,13 @@ class GymEnvironment(Environment):
     """
 
     Settings = GymSettings
+    snapshot: ClassVar[type[GymTransition]] = GymTransition
 
-    def __init__(self, settings: GymSettings, rewards: Sequence[RewardTerm], seed: int = 0):
-        if rewards:
-            names = ", ".join(term.name for term in rewards)
-            raise ValueError(
-                f"{settings.id!r} has its own rewards, and those of the run file ({names}) don't "
-                "apply: leave `rewards` out"
-            )
+    def __init__(self, settings: GymSettings, rewards: Sequence[RewardTerm[Any]], seed: int = 0):
+        self._rewards = fitting(rewards, self.snapshot)
         self._id, self._seed = settings.id, seed
         self.num_envs = settings.num_envs
-        self._vector = make_vector_env(settings, seed)
+        self._vector = make_vector_env(settings, seed, with_infos=bool(rewards))
         try:
             self._observe = ObservationAdapter(self._vector.single_observation_space)
             self._act = ActionAdapter(self._vector.single_action_space)
@@ -90,20 +90,27 @@ class GymEnvironment(Environment):
         Raises:
             EnvironmentFailure: one of them raised an error, or its process died.
         """
-        actions = self._act(actions)
+        actions, before = self._act(actions), self._observations
+        # A copy: an environment may write to what it is given, and these are to be played again.
         observations, reward, terminated, truncated, gathered = self._guarded(
-            self._vector.step, actions
+            self._vector.step, actions.copy()
         )
         self._actions.append(actions)
         self._lengths += 1
-        done = terminated | truncated
-        infos: dict[str, Any] = {}
-        if done.any():
-            infos = {"final_obs": self._final(gathered["final_obs"], done), "_final_obs": done}
-            self._begun[done] += 1
-            self._lengths[done] = 0
-            del self._actions[: len(self._actions) - self._lengths.max()]
         self._observations = self._observe(observations)
+        infos = self._end_episodes(terminated | truncated, gathered)
+        if self._rewards:
+            transition = GymTransition(
+                observations=before,
+                next_observations=_before_reset(self._observations, infos),
+                actions=actions,
+                rewards=reward,
+                terminated=terminated,
+                truncated=truncated,
+                infos={name: given for name, given in gathered.items() if name not in ADDED_INFOS},
+            )
+            infos["reward_terms"] = terms = weigh(self._rewards, transition, self.num_envs)
+            reward = sum(terms.values(), np.zeros(self.num_envs))
         return self._observations, reward, terminated, truncated, infos
 
     def state_dict(self) -> dict[str, Any]:
@@ -143,6 +150,15 @@ class GymEnvironment(Environment):
                 process.join()
             self._vector.closed = True
 
+    def _end_episodes(self, done: NDArray[np.bool_], gathered: Mapping[str, Any]) -> dict[str, Any]:
+        """Counts the episodes that ended, (N,); infos that tell of them, empty where none did."""
+        if not done.any():
+            return {}
+        self._begun[done] += 1
+        self._lengths[done] = 0
+        del self._actions[: len(self._actions) - self._lengths.max()]
+        return {"final_obs": self._final(gathered["final_obs"], done), "_final_obs": done}
+
     def _final(self, last: NDArray[Any], done: NDArray[np.bool_]) -> Observations:
         """Observations (N, ...), right where episodes ended, from an array (N,) of objects."""
         ended = self._observe(self._stacked(list(last[done])))
@@ -174,6 +190,17 @@ class GymEnvironment(Environment):
         except Exception as error:
             reason = f"{type(error).__name__}: {error}".removesuffix(": ")
             raise EnvironmentFailure(f"the environment {self._id!r} failed: {reason}") from error
+
+
+def _before_reset(observations: Observations, infos: Mapping[str, Any]) -> Observations:
+    """Observations (N, ...) after a step; where an episode ended, its last ones."""
+    if not infos:
+        return observations
+    done, final = infos["_final_obs"], infos["final_obs"]
+    following = {name: values.copy() for name, values in observations.items()}
+    for name, values in following.items():
+        values[done] = final[name][done]
+    return following
 
 
 def _equal(first: Observations, second: Observations) -> bool:

@@ -5,17 +5,22 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from envs.gym.vector_env import GymEnvironment
 from trainers.algorithms.ppo import PPO
 from trainers.experience.env_runner import StopRequested
+from trainers.runfile.registry import BUILT_IN_PLUGINS, load_registries, plugin_manager
+from trainers.runfile.settings import load_run
 from trainers.saving.checkpoint import Checkpoints, Loaded
 from trainers.session import Session
 
+REPOSITORY = Path(__file__).parents[2]
 Learn = Callable[..., Any]
 WriteRun = Callable[..., Path]
 PENDULUM = {"type": "gymnasium", "id": "Pendulum-v1", "num_envs": 2, "max_episode_steps": 25}
@@ -77,13 +82,34 @@ def test_what_is_reported_are_the_environments_own_rewards(
     assert np.all(returns < -20)  # swinging about at random costs some 5 a step
 
 
+def test_rewards_are_taken_as_the_documentation_shows(write_run: WriteRun) -> None:
+    page = (REPOSITORY / "docs/gymnasium.md").read_text()
+    (code,) = re.findall(r"```python\n(# my_rewards.py\n.*?)```", page, re.DOTALL)
+    (listed,) = re.findall(r"```yaml\n(rewards:\n.*?)```", page, re.DOTALL)
+    plugin = ModuleType("my_rewards")
+    exec(code, vars(plugin))
+    registries = load_registries(plugin_manager((*BUILT_IN_PLUGINS, plugin)))
+    config = write_run(PENDULUM, NORMALIZED, **yaml.safe_load(listed))
+    session = Session(load_run(config, [], registries), registries)
+    session.reset()
+    session.algorithm.collect()
+    episodes = session.env_runner.pop_finished()
+    assert episodes.terms.keys() == {"environment", "effort"}
+    assert np.all(episodes.terms["environment"] < -20)
+    assert np.all(episodes.terms["effort"] < 0)
+    np.testing.assert_allclose(episodes.rewards, sum(episodes.terms.values()))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"environment": {"id": "Pendulm-v1"}}, r"environment \(gymnasium\): id: .*'Pendulum-v1'"),
         ({"environment": {"kwargs": {"gg": 1.0}}}, r"environment \(gymnasium\): .*argument 'gg'"),
         ({"environment": {"ids": "x"}}, "environment.ids: unknown key; did you mean 'id'"),
-        ({"rewards": [{"type": "touch"}]}, r"environment \(gymnasium\): .*\(touch\) don't apply"),
+        (
+            {"rewards": [{"type": "touch"}]},
+            r"environment \(gymnasium\): .*'touch' is computed",
+        ),
         (
             {"environment_parameters": {"gravity": 1.0}},
             "environment_parameters: the environment has no parameter 'gravity'",

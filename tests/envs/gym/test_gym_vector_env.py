@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -18,6 +18,9 @@ from envs.environment import EnvironmentFailure
 from envs.gym.episodes import episode_seed
 from envs.gym.settings import GymSettings
 from envs.gym.vector_env import GymEnvironment
+from rewards.gym.environment import EnvironmentReward
+from rewards.gym.transition import GymTransition
+from rewards.plugin import ventosa_rewards
 from rewards.reward import RewardTerm
 
 ROOM_STEPS = 6
@@ -59,7 +62,8 @@ class Room(gymnasium.Env[Any, Any]):
         if self.steps == 2 and self.trouble == "death":
             os.kill(os.getpid(), signal.SIGKILL)
         over = self.steps == self.length
-        return self._observation(), float(action), over and self.sum % 2 == 0, over, {}
+        info = {"sum": self.sum, "nested": {"steps": self.steps}}
+        return self._observation(), float(action), over and self.sum % 2 == 0, over, info
 
     def _observation(self) -> dict[str, Any]:
         rng = self.elsewhere if self.trouble == "forgetful" else self.np_random
@@ -77,8 +81,13 @@ def registered() -> Iterator[None]:
     del gymnasium.registry["ventosa_tests/Room-v0"]
 
 
-def make(env_id: str = "ventosa_tests/Room-v0", count: int = 3, **settings: Any) -> GymEnvironment:
-    return GymEnvironment(GymSettings(id=env_id, num_envs=count, **settings), [], seed=7)
+def make(
+    env_id: str = "ventosa_tests/Room-v0",
+    count: int = 3,
+    rewards: Sequence[RewardTerm[Any]] = (),
+    **settings: Any,
+) -> GymEnvironment:
+    return GymEnvironment(GymSettings(id=env_id, num_envs=count, **settings), rewards, seed=7)
 
 
 def actions_for(env: GymEnvironment, steps: int) -> list[np.ndarray]:
@@ -281,10 +290,166 @@ def test_a_missing_package_is_named_with_what_installs_it(
         make(env_id)
 
 
-def test_rewards_of_the_run_file_are_refused() -> None:
-    terms = [RewardTerm("touch", 1.0, lambda transition: np.zeros(1))]
-    with pytest.raises(ValueError, match=r"'CartPole-v1' has its own rewards.*\(touch\).*leave"):
-        GymEnvironment(GymSettings(id="CartPole-v1"), terms)
+# -- rewards --------------------------------------------------------------------------------------
+
+
+class Diary:
+    """A reward that keeps what it is shown; pays 1 in the first environment, 2 in the second."""
+
+    snapshot = GymTransition
+
+    def __init__(self) -> None:
+        self.shown: list[GymTransition] = []
+
+    def __call__(self, transition: GymTransition) -> np.ndarray:
+        self.shown.append(transition)
+        return np.arange(1.0, len(transition.rewards) + 1.0)
+
+
+def own_reward(weight: float) -> RewardTerm[GymTransition]:
+    return RewardTerm("environment", weight, EnvironmentReward(EnvironmentReward.Settings()))
+
+
+def test_the_reward_is_the_weighted_sum_of_the_terms() -> None:
+    plain, env = make(), make(rewards=[own_reward(0.5), RewardTerm("diary", -3.0, Diary())])
+    plain.reset()
+    env.reset()
+    for actions in actions_for(env, 20):
+        expected = plain.step(actions)
+        observations, reward, *ends, infos = env.step(actions)
+        terms = infos.pop("reward_terms")
+        np.testing.assert_array_equal(terms["environment"], 0.5 * expected[1])
+        np.testing.assert_array_equal(terms["diary"], [-3.0, -6.0, -9.0])
+        np.testing.assert_array_equal(reward, terms["environment"] + terms["diary"])
+        assert_same([observations, *ends, infos], [expected[0], *expected[2:]])
+    assert_same(env.state_dict(), plain.state_dict())
+
+
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+def test_a_reward_sees_what_one_environment_by_itself_does(vectorization: Any) -> None:
+    """With infos and observations of the very step, even where it ended an episode."""
+    diary = Diary()
+    with closing(
+        make(rewards=[RewardTerm("diary", 1.0, diary)], vectorization=vectorization)
+    ) as env:
+        env.reset()
+        actions = actions_for(env, 20)
+        for now in actions:
+            env.step(now)
+    assert len(diary.shown) == 20
+    for i in range(3):
+        room, begun, ends = Room(), 0, 0
+        before, _ = room.reset(seed=episode_seed(7, i, begun))
+        for shown, now in zip(diary.shown, actions, strict=True):
+            after, reward, terminated, truncated, info = room.step(np.int64(now[i] + 1))
+            np.testing.assert_array_equal(shown.observations["view"][i], before["view"])
+            np.testing.assert_array_equal(shown.next_observations["view"][i], after["view"])
+            assert shown.actions[i] == now[i] + 1  # as the environment counts them
+            assert (shown.rewards[i], shown.terminated[i], shown.truncated[i]) == (
+                reward,
+                terminated,
+                truncated,
+            )
+            assert shown.infos["sum"][i] == info["sum"]
+            assert shown.infos["_sum"].all()
+            assert set(shown.infos) == {"sum", "_sum", "nested", "_nested"}
+            assert shown.infos["nested"]["steps"][i] == info["nested"]["steps"]
+            before = after
+            if terminated or truncated:
+                begun, ends = begun + 1, ends + 1
+                before, _ = room.reset(seed=episode_seed(7, i, begun))
+        assert ends > 2
+
+
+def test_without_rewards_no_infos_are_gathered() -> None:
+    env = make()
+    env.reset()
+    seen = [set(env._vector.step(env._act(now))[4]) for now in actions_for(env, 10)]
+    assert seen[0] == set()
+    assert {"sum", "_sum"}.isdisjoint(set().union(*seen))
+
+
+def test_going_on_with_rewards_is_exact() -> None:
+    terms = [own_reward(1.0), RewardTerm("diary", 0.1, Diary())]
+    env, other = make(rewards=terms), make(rewards=terms)
+    env.reset()
+    actions = actions_for(env, 30)
+    for now in actions[:15]:
+        env.step(now)
+    other.load_state_dict(env.state_dict())
+    for now in actions[15:]:
+        assert_same(env.step(now), other.step(now))
+
+
+def test_a_reward_for_another_snapshot_is_refused() -> None:
+    touch = ventosa_rewards()["touch"]
+    term = RewardTerm("touch", 1.0, touch(touch.Settings()))  # type: ignore[attr-defined]
+    with pytest.raises(
+        ValueError, match=r"'touch' is computed from a GraspTransition, .* a GymTransition: leave"
+    ):
+        make("CartPole-v1", rewards=[term])
+
+
+# -- arrays of the environment's own --------------------------------------------------------------
+
+
+class Reusing(gymnasium.Env[Any, Any]):
+    """Hands out the same array each time, and scales in place the action that it is given."""
+
+    observation_space = Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = Box(-10.0, 10.0, (1,), np.float64)
+
+    def __init__(self) -> None:
+        self.seen = np.zeros(1)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.seen[:] = 0.0
+        self.steps = 0
+        return self.seen, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        action *= 0.5
+        self.seen += action
+        self.steps += 1
+        return self.seen, 0.0, False, self.steps == 5, {"seen": self.seen}
+
+
+@pytest.fixture
+def reusing() -> Iterator[str]:
+    gymnasium.register("ventosa_tests/Reusing-v0", entry_point=Reusing)
+    yield "ventosa_tests/Reusing-v0"
+    del gymnasium.registry["ventosa_tests/Reusing-v0"]
+
+
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+def test_the_last_observation_is_not_overwritten_by_the_reset(
+    reusing: str, vectorization: Any
+) -> None:
+    diary = Diary()
+    rewards = [RewardTerm("diary", 1.0, diary)]
+    with closing(make(reusing, 2, rewards, vectorization=vectorization)) as env:
+        env.reset()
+        for _ in range(5):
+            observations, *_, infos = env.step(np.array([[2.0], [4.0]]))
+    assert infos["final_obs"]["observation"].tolist() == [[5.0], [10.0]]
+    assert observations["observation"].tolist() == [[0.0], [0.0]]
+    assert diary.shown[-1].next_observations["observation"].tolist() == [[5.0], [10.0]]
+    assert diary.shown[-1].infos["seen"].tolist() == [[5.0], [10.0]]
+
+
+def test_an_action_written_to_is_played_again_as_it_was(reusing: str) -> None:
+    env, other = make(reusing, 2), make(reusing, 2)
+    env.reset()
+    actions = np.array([[2.0], [4.0]])
+    for _ in range(3):
+        env.step(actions)
+    state = env.state_dict()
+    assert actions.tolist() == [[2.0], [4.0]]
+    assert state["actions"].tolist() == [[[2.0], [4.0]]] * 3
+    for _ in range(2):  # and playing them again changes nothing, either
+        assert other.load_state_dict(state)["observation"].tolist() == [[3.0], [6.0]]
+    assert other.state_dict()["actions"].tolist() == [[[2.0], [4.0]]] * 3
 
 
 # -- failures -------------------------------------------------------------------------------------

@@ -132,7 +132,7 @@ def test_an_unknown_name_is_answered_with_the_nearest() -> None:
     )
     with pytest.raises(UnknownComponentError, match="unknown reward 'tuoch'; did you mean 'touch'"):
         registry.get("tuoch")
-    with pytest.raises(UnknownComponentError, match="known: approach, collision, facing"):
+    with pytest.raises(UnknownComponentError, match="known: approach, collision, environment,"):
         registry.get("zzz")
     with pytest.raises(UnknownComponentError, match="none is known"):
         Registry("reward", {}).get("touch")
@@ -175,6 +175,11 @@ def call(self: Any) -> None: ...
         ("rewards", component("L", __call__=call, Settings=Loose), 'extra="forbid"'),
         ("rewards", component("M", __call__=call, Settings=Mutable), "frozen=True"),
         ("rewards", component("Still", Settings=Empty), "Still is not callable"),
+        (
+            "rewards",
+            component("Seen", __call__=call, Settings=Empty, snapshot="Walk"),
+            "Seen.snapshot is not a class",
+        ),
         ("rewards", component("W", __call__=call, Settings=Weighted), "the field 'weight'"),
         ("rewards", component("T", __call__=call, Settings=Typed), "the field 'type'"),
         ("encoders", component("Flat", Settings=Empty), "Flat is no torch.nn.Module"),
