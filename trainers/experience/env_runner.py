@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.environment import Environment
+from envs.environment import Environment, EnvironmentFailure
 from trainers.common.timers import timed
 
 SUCCESS = "success"
@@ -33,7 +33,7 @@ class Step:
         truncated: (N,) the episode was cut off: what would follow has a value.
         same_frame: (N,) the images of the new observation are those of the one before.
         final_observations: (N, ...) as they were before the reset, right where an episode ended;
-            None where none did.
+            None where none did. There wherever one was truncated.
     """
 
     reward: NDArray[np.float64]
@@ -129,6 +129,7 @@ class EnvRunner:
         Raises:
             StopRequested: the run is to stop; nothing was done.
             NonFiniteError: a reward or an observation is NaN or infinite.
+            EnvironmentFailure: an episode was truncated, and its last observation is not there.
         """
         if self._stop_requested():
             raise StopRequested
@@ -142,6 +143,11 @@ class EnvRunner:
         self._check_observations(observations)
         done = terminated | truncated
         final = infos.get("final_obs") if done.any() else None
+        if not final and (truncated & ~terminated).any():
+            raise EnvironmentFailure(
+                f"step {self.step_count}: an episode was truncated, and the infos have no "
+                "`final_obs`: what would follow can't be valued without its last observation"
+            )
         self._check_observations(final or {}, done)
         self._add_up(reward, terms, infos.get("episode_metrics", {}), done)
         self.observations = observations

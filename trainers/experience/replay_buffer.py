@@ -241,13 +241,11 @@ class ReplayBuffer:
 
         What terminated has nothing after it that a learner could want to know the value of.
         """
-        cut = np.flatnonzero(step.truncated & ~step.terminated)
+        cut, final = np.flatnonzero(step.truncated & ~step.terminated), step.final_observations
         self._final[indices] = NONE
         if not len(cut):
             return
-        if step.final_observations is None:
-            raise ValueError("an episode was truncated, and the infos have no `final_obs`")
-        final = step.final_observations
+        assert final is not None  # the env runner sees to it
         frame = self._frame[indices].copy()
         differ = frames_differ(final, observations, self._frames.names, cut)
         frame[cut[differ]] = self._frames.add(final, cut[differ])

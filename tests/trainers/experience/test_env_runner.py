@@ -11,6 +11,7 @@ import pytest
 from gymnasium.spaces import Box
 
 from encoders.spaces import RgbImage
+from envs.environment import EnvironmentFailure
 from trainers.experience.env_runner import (
     EnvRunner,
     EpisodeBatch,
@@ -163,6 +164,34 @@ def test_a_broken_last_observation_is_named_where_an_episode_ended(scripted: Any
         NonFiniteError, match=r"^step 6: the observation 'x' of environment 1 is nan"
     ):
         env_runner.step(ACTIONS)
+
+
+def test_a_truncated_episode_needs_its_last_observation(scripted: Any) -> None:
+    env_runner = begun(script(scripted, final=None))
+    env_runner.step(ACTIONS)
+    with pytest.raises(
+        EnvironmentFailure, match=r"^step 4: an episode was truncated, .* no `final_obs`"
+    ):
+        env_runner.step(ACTIONS)
+    # Where it ended of its own, too, nothing would follow.
+    env_runner = begun(script(scripted, final=None, terminated=ENDS))
+    assert [env_runner.step(ACTIONS).done.any() for _ in range(2)] == [False, True]
+
+
+@pytest.mark.parametrize("trainer_type", ["ppo", "trpo", "ddpg"])
+def test_no_algorithm_learns_from_truncation_without_the_last_observation(
+    make_algorithm: Any, monkeypatch: pytest.MonkeyPatch, trainer_type: str
+) -> None:
+    algorithm = make_algorithm(trainer_type)
+    step = algorithm._env_runner.env.step
+
+    def forgetful(actions: Any) -> Any:
+        *rest, infos = step(actions)
+        return *rest, {k: v for k, v in infos.items() if not k.endswith("final_obs")}
+
+    monkeypatch.setattr(algorithm._env_runner.env, "step", forgetful)
+    with pytest.raises(EnvironmentFailure, match="no `final_obs`"):
+        algorithm.collect()
 
 
 def test_going_back_to_a_state_of_other_environments_is_refused(scripted: Any) -> None:

@@ -351,14 +351,6 @@ def test_a_state_is_no_copy() -> None:
     assert np.shares_memory(first, second)
 
 
-def test_an_end_without_its_last_observation_is_refused() -> None:
-    buffer = ReplayBuffer(LINE, 1, 1, 4, CPU)
-    cut, no = np.ones(1, bool), np.zeros(1, bool)
-    x = {"x": np.zeros((1, 1), np.float32)}
-    with pytest.raises(ValueError, match="no `final_obs`"):
-        buffer.add(x, np.zeros((1, 1), np.float32), Step(np.zeros(1), no, cut, no, None), x)
-
-
 def test_a_buffer_larger_than_any_memory_is_the_users_mistake() -> None:
     with pytest.raises(UserError, match=r"buffer_size: there is no room for 10{13} .*lower it$"):
         ReplayBuffer(LINE, 1, 1, 10**13, CPU)
