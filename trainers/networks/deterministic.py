@@ -13,7 +13,7 @@ from trainers.networks.actions import ActionScaling
 from trainers.networks.actor_critic import ACTOR_GAIN, CRITIC_GAIN, ActorCriticSettings, observed
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.frame_features import FrameFeatures
-from trainers.networks.network import Network, NetworkSettings, head, hidden_layers
+from trainers.networks.network import Network, NetworkSettings, head, hidden_layers, precision
 from trainers.networks.observations import Observations
 from trainers.networks.off_policy_network import OffPolicyNetwork, TargetAverage
 
@@ -72,16 +72,16 @@ class DeterministicActorCritic(nn.Module):
             self.actor_encoder = factory.network(encoders_alone, self.actor_sees)
         size = ActionScaling(factory.action_space).size
         actor_inputs = self._acting_encoder.features_dim
-        self.actor = nn.Sequential(*_layers(actor_inputs, size, ACTOR_GAIN, settings), nn.Tanh())
+        self.actor = _Dense(actor_inputs, size, ACTOR_GAIN, settings)
         critic_inputs = self.critic_encoder.features_dim + size
-        self.critic = nn.Sequential(*_layers(critic_inputs, 1, CRITIC_GAIN, settings))
+        self.critic = _Dense(critic_inputs, 1, CRITIC_GAIN, settings)
 
     def act(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
         """mu(s): actions (B, A) in [-1, 1]; `encode_frames` may have looked at the frames."""
         features = self._acting_encoder(observations, frame_features)
         if self.actor_encoder is None:
             features = features.detach()
-        actions: Tensor = self.actor(features)
+        actions: Tensor = self.actor(features).tanh()
         return actions
 
     def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
@@ -168,6 +168,19 @@ class DeterministicPolicy(OffPolicyNetwork):
         self._average.copy_buffers()
 
 
-def _layers(inputs: int, outputs: int, gain: float, settings: NetworkSettings) -> list[nn.Module]:
-    hidden, width = hidden_layers(inputs, settings)
-    return [*hidden, head(width, outputs, gain)]
+class _Dense(nn.Sequential):
+    """Hidden layers in the precision of the settings, and a last one in float32."""
+
+    def __init__(self, inputs: int, outputs: int, gain: float, settings: NetworkSettings):
+        hidden, width = hidden_layers(inputs, settings)
+        super().__init__(*hidden, head(width, outputs, gain))
+        self._settings = settings
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, inputs) -> (B, outputs) float32."""
+        *hidden, last = self
+        with precision(self._settings, features.device):
+            for layer in hidden:
+                features = layer(features)
+        outputs: Tensor = last(features.float())
+        return outputs

@@ -78,7 +78,7 @@ class Network(nn.Module):
         )
         width = sum(cast(int, encoder.features_dim) for encoder in encoders.values())
         self.trunk, width = hidden_layers(width, settings)
-        self._lowered = settings.precision == "bfloat16"
+        self._settings = settings
         self.memory = None if memory is None else Recurrent(width, memory)
         self.features_dim = width if self.memory is None else self.memory.features_dim
         self.state_size = 0 if self.memory is None else self.memory.state_size
@@ -91,7 +91,7 @@ class Network(nn.Module):
         """
         if not self.frame_encoders:
             return None
-        with self._precision(next(iter(frames.values())).device):
+        with precision(self._settings, next(iter(frames.values())).device):
             parts = [encoder(frames[name]) for name, encoder in self.frame_encoders.items()]
             features = _joined(parts)
             return (features if self.vector_encoders else self.trunk(features)).float()
@@ -132,13 +132,9 @@ class Network(nn.Module):
         if not self.vector_encoders:
             return parts[0]
         vectors = observations.vectors
-        with self._precision(next(iter(vectors.values())).device):
+        with precision(self._settings, next(iter(vectors.values())).device):
             parts += [encoder(vectors[name]) for name, encoder in self.vector_encoders.items()]
             return self.trunk(_joined(parts)).float()
-
-    def _precision(self, device: torch.device) -> AbstractContextManager[None]:
-        # Entering autocast costs time even where it is not enabled.
-        return torch.autocast(device.type, torch.bfloat16) if self._lowered else nullcontext()
 
     def update_statistics(self, vectors: Mapping[str, Tensor]) -> None:
         """Shows vectors (B, n) to the encoders that standardise."""
@@ -156,6 +152,13 @@ def _orthogonal(layer: nn.Linear, gain: float) -> nn.Linear:
     nn.init.orthogonal_(layer.weight, gain)
     nn.init.zeros_(layer.bias)
     return layer
+
+
+def precision(settings: NetworkSettings, device: torch.device) -> AbstractContextManager[None]:
+    """Where encoders and hidden layers calculate as the settings say."""
+    # Entering autocast costs time even where it is not enabled.
+    lowered = settings.precision == "bfloat16"
+    return torch.autocast(device.type, torch.bfloat16) if lowered else nullcontext()
 
 
 def hidden_layers(inputs: int, settings: NetworkSettings) -> tuple[nn.Sequential, int]:
