@@ -23,7 +23,7 @@ from trainers.networks.recurrent import MemorySettings
 
 ACTOR_GAIN = 0.01  # a small last layer: at first every observation gets nearly the same action
 CRITIC_GAIN = 1.0
-TINY_STD = 1e-6
+NO_LOG_STD = -1000.0  # exp of it is 0
 NETWORK_PATH = "trainer.network_settings"
 
 
@@ -48,7 +48,10 @@ class PolicySettings(ActorCriticSettings, frozen=True, extra="forbid"):
         1.0, gt=0.0, description="Continuous actions: standard deviation to begin with."
     )
     min_std: float = Field(
-        0.001, gt=0.0, description="Continuous actions: the standard deviation never falls below."
+        0.001,
+        gt=0.0,
+        description="Continuous actions: the standard deviation never falls below; equal to "
+        "initial_std, it stays there and is not learned.",
     )
     memory: MemorySettings | None = Field(
         None, description="A recurrent layer in the actor and in a separate critic; null: none."
@@ -100,8 +103,9 @@ class ActorCritic(PolicyNetwork):
         match factory.action_space:
             case gymnasium.spaces.Box(shape=(size,)):
                 self.action_head = head(width, size, ACTOR_GAIN)
-                above = math.log(max(settings.initial_std - settings.min_std, TINY_STD))
-                self.log_std = nn.Parameter(torch.full((size,), above))
+                above = settings.initial_std - settings.min_std
+                log_std = torch.full((size,), math.log(above) if above else NO_LOG_STD)
+                self.log_std = nn.Parameter(log_std, requires_grad=above > 0)
             case gymnasium.spaces.Discrete(n=count):
                 self.action_head = head(width, int(count), ACTOR_GAIN)
             case other:

@@ -224,6 +224,34 @@ def test_the_spread_never_falls_below_its_least(make_factory: MakeFactory) -> No
     assert distribution.log_std.exp().tolist() == pytest.approx([0.1])
 
 
+@pytest.mark.parametrize("std", [0.001, 0.25, 1.0, 3.0])
+def test_a_spread_that_begins_at_its_least_is_fixed(make_factory: MakeFactory, std: float) -> None:
+    policy = make_policy(make_factory, initial_std=std, min_std=std)
+    distribution = policy.distribution(some_observations(2))
+    assert isinstance(distribution, DiagonalGaussian)
+    assert torch.equal(distribution.log_std, torch.full((1,), math.log(std)))
+    (-distribution.log_prob(torch.ones(2, 1)).mean()).backward()
+    assert policy.log_std is not None
+    assert policy.log_std.grad is None
+    assert policy.action_head.weight.grad is not None
+
+
+@pytest.mark.parametrize("trainer_type", ["ppo", "trpo"])
+def test_no_update_moves_a_fixed_spread(
+    make_algorithm: Callable[..., Any], trainer_type: str
+) -> None:
+    algorithm = make_algorithm(trainer_type, network={"initial_std": 0.3, "min_std": 0.3})
+    before = {name: values.clone() for name, values in algorithm.policy.state_dict().items()}
+    algorithm.collect()
+    statistics = algorithm.update(0.0)
+    after = algorithm.policy.state_dict()
+    assert torch.equal(after["log_std"], before["log_std"])
+    assert not torch.equal(after["action_head.weight"], before["action_head.weight"])
+    # H = A (log sigma + (1 + log 2 pi) / 2) of two dimensions
+    entropy = 2 * (math.log(0.3) + (1 + math.log(2 * math.pi)) / 2)
+    assert statistics["Policy/Entropy"] == pytest.approx(entropy)
+
+
 def test_discrete_actions_start_nearly_uniform(make_factory: MakeFactory) -> None:
     torch.manual_seed(0)
     factory = make_factory({"joints": JOINTS}, action_space=Discrete(4))
