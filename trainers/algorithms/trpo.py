@@ -12,6 +12,7 @@ gain made linear and its constraint quadratic (appendix C); a line search for wh
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Literal
 
@@ -173,10 +174,12 @@ class TRPO(OnPolicyAlgorithm):
         hyper = self._hyperparameters
         size = max(1, round(hyper.fisher_fraction * len(rollout)))
         rows = next(rollout.minibatches(size, self._generator))
-        distribution = self.policy.distribution(rollout.observations(rows))
+        with _differentiable_twice(self.policy):
+            distribution = self.policy.distribution(rollout.observations(rows))
+            fisher = fisher_product(distribution, self._theta, hyper.damping)
         return kl_constrained_step(
             gradient,
-            fisher_product(distribution, self._theta, hyper.damping),
+            fisher,
             delta,
             iterations=hyper.cg_iterations,
             tolerance=hyper.cg_tolerance,
@@ -318,6 +321,11 @@ def line_search(
             return LineSearch(gain, divergence, trial + 1, accepted=True)
     _assign(parameters, old)
     return LineSearch(old_gain, 0.0, iterations, accepted=False)
+
+
+def _differentiable_twice(policy: ActorCritic) -> AbstractContextManager[None]:
+    """Where gradients of the policy have gradients: cuDNN's recurrent layers have none."""
+    return torch.backends.cudnn.flags(enabled=False) if policy.state_size else nullcontext()
 
 
 def _flat(tensors: Iterable[Tensor]) -> Tensor:

@@ -553,6 +553,37 @@ def test_an_encoder_with_frozen_weights_stays_as_it_is(
     assert changed(before, iter(free))
 
 
+MEMORIES: list[Any] = [{"type": kind, "memory_size": 8} for kind in ("lstm", "gru")]
+
+
+@pytest.mark.parametrize(("memory", "enabled"), [(None, True), (MEMORIES[0], False)])
+def test_cudnn_which_has_no_second_derivative_of_memory_is_spared_it(
+    make_trpo: MakeTRPO, monkeypatch: pytest.MonkeyPatch, memory: Any, enabled: bool
+) -> None:
+    seen: list[bool] = []
+    product = trpo.fisher_product
+
+    def watched(*arguments: Any) -> Any:
+        seen.append(torch.backends.cudnn.enabled)
+        return product(*arguments)
+
+    monkeypatch.setattr(trpo, "fisher_product", watched)
+    one_round(make_trpo("recall", {}, {"memory": memory}))
+    assert seen == [enabled]
+    assert torch.backends.cudnn.enabled
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU: TRPO with memory on CUDA")
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_it_takes_a_step_with_memory_on_cuda(make_trpo: MakeTRPO, memory: Any) -> None:
+    algorithm = make_trpo("recall", {}, {"memory": memory}, device="cuda")
+    before = snapshot(algorithm.policy.actor_parameters())
+    statistics = one_round(algorithm)
+    assert all(math.isfinite(value) for value in statistics.values())
+    assert statistics["Policy/Step Accepted"] == 1.0
+    assert changed(before, algorithm.policy.actor_parameters())
+
+
 # -- learning ------------------------------------------------------------------------------------
 
 
