@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 _LEAST_VARIANCE = 1e-8
+_ROUNDING = 1e-12  # a relative deviation that is none
 
 
 class RunningNormalizer(nn.Module):
@@ -14,13 +15,20 @@ class RunningNormalizer(nn.Module):
     The moments are buffers, hence saved with the weights; float64, because a running sum over
     millions of samples outgrows float32. Before the first update nothing but the clip acts.
 
+    An input that has been constant so far has no scale yet: it is shifted and not scaled, as by
+    scikit-learn's `StandardScaler`, and those samples count on with the variance 1. So when it
+    first moves, by d, what comes out moves by about d. By the moments alone it would jump, however
+    little it moved: where a fraction p of all samples has, they stand sqrt((1 - p) / p) deviations
+    from the mean, which a least deviation prevents for inputs of one scale only. While the input
+    goes on varying, its own variance takes over.
+
     Args:
         size: Length n of the vectors.
         clip: Largest absolute value that comes out.
 
     Attributes:
         mean: (n,) float64.
-        variance: (n,) float64, of the population (divided by the count).
+        variance: (n,) float64, of the population (divided by the count); 1 while it is constant.
         count: () float64, vectors seen.
     """
 
@@ -52,15 +60,16 @@ class RunningNormalizer(nn.Module):
             return
         values = batch.to(torch.float64)
         total = self.count + added
-        delta = values.mean(0) - self.mean
+        mean, variance = values.mean(0), values.var(0, correction=0)
+        delta = mean - self.mean
         # M_ab = M_a + M_b + delta^2 n_a n_b / n, with M the sum of squared deviations
         squares = (
-            self.variance * self.count
-            + values.var(0, correction=0) * added
-            + delta**2 * self.count * added / total
+            self.variance * self.count + variance * added + delta**2 * self.count * added / total
         )
+        spread = variance + torch.where(self.count > 0, delta, 0.0) ** 2
+        constant = spread <= (_ROUNDING * mean) ** 2
         self.mean += delta * added / total
-        self.variance.copy_(squares / total)
+        self.variance.copy_(torch.where(constant, self.variance, squares / total))
         self.count.copy_(total)
 
     def forward(self, values: torch.Tensor) -> torch.Tensor:

@@ -21,7 +21,7 @@ def batches(sizes, seed):
 
 @given(sizes=st.lists(st.integers(0, 20), min_size=1, max_size=6), seed=st.integers(0, 1000))
 def test_moments_are_those_of_all_batches_together(sizes, seed):
-    parts = batches([*sizes, 2], seed)
+    parts = batches([2, *sizes], seed)  # the first of several: what doesn't vary has no scale
     normalizer = RunningNormalizer(3)
     for part in parts:
         normalizer.update(torch.from_numpy(part))
@@ -49,6 +49,53 @@ def test_a_value_that_never_changes_gives_zero():
     normalizer = RunningNormalizer(1)
     normalizer.update(torch.full((10, 1), 0.1))
     assert normalizer(torch.tensor([[0.1]])).item() == 0
+
+
+LESSONS = torch.tensor(  # goal limits (dm, 0.1 rad) of the first two lessons of config/run.yaml
+    [[1.0, 1.0, 1.2, 1.7453], [0.95, 0.95, 1.1444, 1.6678]], dtype=torch.float64
+)
+
+
+def test_what_was_constant_does_not_jump_when_it_first_moves():
+    first, second = (lesson.expand(4096, 4) for lesson in LESSONS)
+    step = (LESSONS[0] - LESSONS[1]).numpy()
+    normalizer = RunningNormalizer(4)
+    for _ in range(14):
+        normalizer.update(first)
+    assert normalizer(first[:1]).abs().max() < 1e-6
+    np.testing.assert_allclose(normalizer(second[:1])[0], -step, rtol=1e-6)
+    normalizer.update(second)
+    # A fifteenth of the samples moved: mean c - d / 15, variance 14 / 15 + d^2 14 / 225; from the
+    # moments alone it would be -sqrt(14) = -3.7, whatever d is.
+    expected = -step * 14 / 15 / np.sqrt(14 / 15 + step**2 * 14 / 225)
+    np.testing.assert_allclose(normalizer(second[:1])[0], expected, rtol=1e-6)
+
+
+@given(seed=st.integers(0, 1000), offset=st.sampled_from([0.0, 0.1, -3.0, 1e4]))
+def test_what_goes_on_varying_is_standardised_at_last(seed, offset):
+    normalizer = RunningNormalizer(1)
+    normalizer.update(torch.full((7, 1), offset, dtype=torch.float64))
+    values = offset + np.random.default_rng(seed).normal(0.0, 0.5, (100_000, 1))
+    for part in np.split(values, 100):
+        normalizer.update(torch.from_numpy(part))
+    assert normalizer.deviation.item() == pytest.approx(values.std(), rel=1e-3)
+    assert normalizer.mean.item() == pytest.approx(values.mean(), abs=1e-3)
+
+
+def test_an_event_that_no_one_has_seen_yet_is_no_outlier():
+    normalizer = RunningNormalizer(1)
+    for _ in range(100):
+        normalizer.update(torch.zeros(1000, 1))
+    normalizer.update(torch.nn.functional.one_hot(torch.tensor(0), 1000)[:, None])
+    assert normalizer(torch.tensor([[1.0]])).item() == pytest.approx(1.0, abs=0.01)
+
+
+def test_constant_through_one_batch_is_not_constant_so_far():
+    normalizer = RunningNormalizer(1)
+    normalizer.update(torch.tensor([[0.0], [2.0]]))
+    normalizer.update(torch.tensor([[0.0], [0.0]]))  # 0, 2, 0, 0: mean 1/2, variance 3/4
+    assert normalizer.mean.item() == 0.5
+    assert normalizer.variance.item() == 0.75
 
 
 def test_before_any_update_values_pass():
