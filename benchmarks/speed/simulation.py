@@ -12,12 +12,11 @@ import numpy as np
 from benchmarks.agreement import Sample
 from benchmarks.speed.figures import FAST, MODES, PYBULLET, Figures, race, rate
 from encoders.spaces import DepthImage
-from envs.grasp.env import make_vector_env
+from envs.grasp.env import built_in_rewards, make_vector_env
 from envs.grasp.observations import observation_space
 from envs.grasp.settings import Camera, GraspSettings
 from envs.grasp.simulators.factory import make_simulator
 from envs.grasp.vector_env import GraspVectorEnv
-from rewards.plugin import ventosa_rewards
 
 FRAMES = {"depth": "depth frames", "rgb": "color frames"}
 """Types of camera, and what is measured with them."""
@@ -64,7 +63,7 @@ def steps(mode: str, size: int, num_envs: Sequence[int], rounds: int, seconds: f
         for name, n in [(FAST, first), (PYBULLET, first), *((FAST, n) for n in more)]:
             env = make_vector_env(
                 n,
-                rewards=dict.fromkeys(ventosa_rewards(), 1.0),
+                rewards=dict.fromkeys(built_in_rewards(), 1.0),
                 cameras={"depth": Camera(type="depth", width=size, height=size)},
                 frame_grab=MODES[mode],
                 simulator=name,

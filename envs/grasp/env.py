@@ -20,6 +20,11 @@ DEFAULT_REWARDS = dict.fromkeys(
 )
 
 
+def built_in_rewards() -> dict[str, type]:
+    """The built-in rewards of the grasp task by name."""
+    return {name: cls for name, cls in ventosa_rewards().items() if fits(cls, GraspTransition)}
+
+
 def make_vector_env(
     num_envs: int = 1,
     rewards: Mapping[str, float] = DEFAULT_REWARDS,
@@ -39,7 +44,7 @@ def make_vector_env(
     Raises:
         ValueError: a setting or a reward that does not exist, or does not fit.
     """
-    built_in = {k: cls for k, cls in ventosa_rewards().items() if fits(cls, GraspTransition)}
+    built_in = built_in_rewards()
     if unknown := sorted(set(rewards) - set(built_in)):
         raise ValueError(f"unknown rewards {unknown}; there are {sorted(built_in)}")
     terms = [
