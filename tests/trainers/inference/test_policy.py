@@ -160,9 +160,13 @@ def test_weights_that_do_not_fit_are_refused_with_torchs_reason(saved: Save) -> 
 def test_a_plugin_that_is_not_installed_is_named(saved: Save) -> None:
     folder, _ = saved()
     path = folder / FILE
-    content = path.read_text().replace('"ppo"', '"sac"').replace('"built-in"', '"theirs 1.2"')
+    content = (
+        path.read_text().replace('"ppo"', '"unheard_of"').replace('"built-in"', '"theirs 1.2"')
+    )
     path.write_text(content)
-    with pytest.raises(UserError, match=r"trainer 'sac' of theirs 1\.2, which is not installed"):
+    with pytest.raises(
+        UserError, match=r"trainer 'unheard_of' of theirs 1\.2, which is not installed"
+    ):
         Policy.load(folder)
 
 
