@@ -18,7 +18,8 @@ from curricula.samplers import ParameterValue
 from envs.environment import Environment, EvaluationReport, PhysicalCheck
 from trainers.algorithms.base import Algorithm
 from trainers.common.errors import UserError
-from trainers.experience.env_runner import SUCCESS, EnvRunner, EpisodeBatch, Step, concatenate
+from trainers.experience.env_runner import EnvRunner
+from trainers.experience.episodes import SUCCESS, EpisodeBatch, concatenate
 from trainers.networks.actions import to_environment
 from trainers.networks.observations import to_tensors
 from trainers.networks.recurrent import Sequences
@@ -173,30 +174,23 @@ class _Player:
         )
         return to_environment(actions, env.single_action_space)
 
-    def step(self, *, deterministic: bool) -> Step:
+    def step(self, *, deterministic: bool) -> None:
         """Acts once everywhere; where an episode ends, it is forgotten."""
         step = self.env_runner.step(self.actions(deterministic=deterministic))
         self._remembered[torch.from_numpy(step.done)] = 0.0
-        return step
 
 
 def _whole_episodes(player: _Player, episodes: int, *, deterministic: bool) -> dict[str, Any]:
-    """Plays until every environment has ended its share of episodes.
+    """Plays until the first `episodes` to begin have ended.
 
-    Shares, because the first episodes to end would be the short ones, not like the others.
+    Those that end first would be the short ones, not like the others.
     """
-    env_runner = player.env_runner
-    count = env_runner.env.num_envs
-    share = np.full(count, episodes // count) + (np.arange(count) < episodes % count)
     parts: list[EpisodeBatch] = []
-    ended = np.zeros(count, np.int64)
     player.reset()
-    while (ended < share).any():
-        done = np.flatnonzero(player.step(deterministic=deterministic).done)
-        finished = env_runner.pop_finished()
-        parts.append(finished[ended[done] < share[done]])
-        ended[done] += 1
-    played = concatenate(parts)
+    while sum(map(len, parts)) < episodes:
+        player.step(deterministic=deterministic)
+        parts.append(player.env_runner.pop_finished())
+    played = concatenate(parts)[:episodes]
     shares = _means(played.episode_metrics)
     rates = {"success": SUCCESS, "collision_rate": COLLISION}
     return {

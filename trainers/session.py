@@ -14,7 +14,8 @@ from envs.environment import Environment
 from rewards.reward import RewardTerm
 from trainers.algorithms.base import Algorithm
 from trainers.common.errors import UserError, suggestion
-from trainers.experience.env_runner import EnvRunner, EpisodeBatch
+from trainers.experience.env_runner import EnvRunner
+from trainers.experience.episodes import EpisodeBatch
 from trainers.inference.construction import network_factory
 from trainers.inference.metadata import Metadata
 from trainers.networks.factory import NetworkFactory
@@ -66,7 +67,7 @@ class Session:
         except BaseException:
             env.close()
             raise
-        env.set_parameters(self._parameters_now())
+        self.env_runner.set_parameters(self._parameters_now())
 
     @property
     def lesson(self) -> int:
@@ -82,16 +83,22 @@ class Session:
         """Begins the run's first episodes."""
         self.env_runner.reset()
 
-    def advance_curriculum(self, episodes: EpisodeBatch, progress: float) -> bool:
-        """Shows finished episodes to the curriculum; True if a new lesson begins."""
+    def advance_curriculum(self, episodes: EpisodeBatch, run_fraction: float) -> bool:
+        """Shows finished episodes to the curriculum; True if a new lesson begins.
+
+        Args:
+            episodes: those of earlier lessons, whose parameters they began with, are passed over.
+            run_fraction: how much of the run is over, in [0, 1].
+        """
         if self.curriculum is None:
             return False
         before = self.lesson
-        finished = FinishedEpisodes(episodes.rewards, episodes.successes, progress)
+        own = episodes[episodes.number >= self.env_runner.parameters_from]
+        finished = FinishedEpisodes(own.rewards, own.successes, run_fraction)
         self._curriculum_state = self.curriculum.advance(self._curriculum_state, finished)
         if self.lesson == before:
             return False
-        self.env_runner.env.set_parameters(self._parameters_now())
+        self.env_runner.set_parameters(self._parameters_now())
         return True
 
     def weights(self) -> dict[str, Tensor]:
@@ -111,7 +118,7 @@ class Session:
         self.algorithm.load_state_dict(weights, state["algorithm"])
         if self.curriculum is not None:
             self._curriculum_state = state["curriculum"]
-        self.env_runner.env.set_parameters(self._parameters_now())
+        self.env_runner.set_parameters(self._parameters_now())
         self.env_runner.load_state_dict(state["interaction"])
 
     def close(self) -> None:

@@ -12,7 +12,7 @@ import torch
 
 from curricula.samplers import UniformSampler
 from trainers.common.errors import UserError
-from trainers.experience.env_runner import EpisodeBatch
+from trainers.experience.episodes import EpisodeBatch
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings
 from trainers.session import Session, resolve_device
@@ -132,8 +132,10 @@ def test_a_lessons_parameters_stand_over_the_runs(make_session: MakeSession) -> 
     assert (session.lesson, session.lesson_count) == (0, 1)
 
 
-def episodes(*rewards: float) -> EpisodeBatch:
-    return EpisodeBatch(np.array(rewards), np.ones(len(rewards)), {}, {})
+def episodes(*rewards: float, first: int = 0) -> EpisodeBatch:
+    """Episodes with numbers from `first` on; the 4 with which a session begins have 0 to 3."""
+    number = first + np.arange(len(rewards))
+    return EpisodeBatch(number, np.array(rewards), np.ones(len(rewards)), {}, {})
 
 
 def test_lessons_advance_with_the_episodes_and_set_the_environment(
@@ -146,8 +148,20 @@ def test_lessons_advance_with_the_episodes_and_set_the_environment(
     assert session.advance_curriculum(episodes(1.0), 0.2)
     assert session.lesson == 1
     assert parameters(session) == {"scale": 2.0}
-    assert not session.advance_curriculum(episodes(0.1, 0.1, 0.1), 0.3)
+    assert not session.advance_curriculum(episodes(0.1, 0.1, 0.1, first=4), 0.3)
     assert not make_session("target").advance_curriculum(episodes(9.0, 9.0), 1.0)
+
+
+def test_episodes_that_were_begun_in_a_lesson_count_for_no_other(
+    make_session: MakeSession,
+) -> None:
+    session = make_session("target", curriculum=LESSONS)
+    session.advance_curriculum(episodes(1.0, 1.0), 0.1)
+    assert session.lesson == 1
+    assert not session.advance_curriculum(episodes(9.0, 9.0), 0.2)  # 2 and 3: still of lesson 1
+    assert not session.advance_curriculum(episodes(9.0, 9.0, first=3), 0.2)
+    assert session.advance_curriculum(episodes(9.0, first=5), 0.2)  # the second after number 4
+    assert session.env_runner.parameters_from == 4  # as many as have begun
 
 
 def test_lessons_of_progress_see_the_runs(make_session: MakeSession) -> None:
@@ -162,13 +176,14 @@ def test_lessons_of_progress_see_the_runs(make_session: MakeSession) -> None:
 def test_a_state_taken_up_goes_on_in_its_lesson(make_session: MakeSession) -> None:
     session = make_session("target", curriculum=LESSONS)
     session.advance_curriculum(episodes(1.0, 1.0), 0.1)
-    session.advance_curriculum(episodes(0.9), 0.1)
+    session.advance_curriculum(episodes(0.9, first=4), 0.1)
     state, weights = copy.deepcopy(session.state_dict()), session.weights()
     other = make_session("target", curriculum=LESSONS, seed=5)
     other.load_state_dict(weights, state)
     assert other.lesson == 1
     assert parameters(other) == {"scale": 2.0}
-    assert other.advance_curriculum(episodes(0.9), 0.1)  # the second good one of this lesson
+    assert not other.advance_curriculum(episodes(0.9), 0.1)  # it is of the lesson before
+    assert other.advance_curriculum(episodes(0.9, first=5), 0.1)  # the second good one of this
     np.testing.assert_equal(
         other.env_runner.observations["goal"], session.env_runner.observations["goal"]
     )

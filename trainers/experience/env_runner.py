@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from curricula.samplers import ParameterValue
 from envs.environment import Environment, EnvironmentFailure
 from trainers.common.timers import timed
-
-SUCCESS = "success"
+from trainers.experience.episodes import Cohorts, EpisodeBatch
 
 
 class StopRequested(Exception):  # noqa: N818 - nothing went wrong
@@ -48,55 +48,6 @@ class Step:
         return self.terminated | self.truncated
 
 
-@dataclass(frozen=True)
-class EpisodeBatch:
-    """k finished episodes, in the order they ended.
-
-    Attributes:
-        rewards: (k,) cumulative rewards.
-        lengths: (k,) steps.
-        terms: (k,) cumulative weighted rewards by term.
-        episode_metrics: (k,) what the environment reports of an episode, by name.
-    """
-
-    rewards: NDArray[np.float64]
-    lengths: NDArray[np.float64]
-    terms: dict[str, NDArray[np.float64]]
-    episode_metrics: dict[str, NDArray[np.float64]]
-
-    def __len__(self) -> int:
-        return len(self.rewards)
-
-    def __getitem__(self, rows: NDArray[np.bool_]) -> EpisodeBatch:
-        return EpisodeBatch(
-            self.rewards[rows],
-            self.lengths[rows],
-            {name: values[rows] for name, values in self.terms.items()},
-            {name: values[rows] for name, values in self.episode_metrics.items()},
-        )
-
-    @property
-    def successes(self) -> NDArray[np.bool_]:
-        """(k,) False where the environment does not report success."""
-        return self.episode_metrics.get(SUCCESS, np.zeros(len(self))).astype(bool)
-
-
-def concatenate(parts: Sequence[EpisodeBatch]) -> EpisodeBatch:
-    """EpisodeBatch of several batches, in their order."""
-    parts = [part for part in parts if len(part)]
-    if not parts:
-        return EpisodeBatch(np.zeros(0), np.zeros(0), {}, {})
-    return EpisodeBatch(
-        np.concatenate([part.rewards for part in parts]),
-        np.concatenate([part.lengths for part in parts]),
-        {name: np.concatenate([part.terms[name] for part in parts]) for name in parts[0].terms},
-        {
-            n: np.concatenate([part.episode_metrics[n] for part in parts])
-            for n in parts[0].episode_metrics
-        },
-    )
-
-
 class EnvRunner:
     """Steps the environments, checks what they return, and adds up the episodes.
 
@@ -107,6 +58,7 @@ class EnvRunner:
     Attributes:
         observations: the present ones, as the environment gave them.
         step_count: steps taken in the run, over all environments.
+        parameters_from: the number of the first episode with the environment's present parameters.
     """
 
     def __init__(self, env: Environment, stop_requested: Callable[[], bool] = lambda: False):
@@ -116,11 +68,27 @@ class EnvRunner:
         self._reward = np.zeros(env.num_envs)
         self._length = np.zeros(env.num_envs)
         self._terms: dict[str, NDArray[np.float64]] = {}
-        self._finished: list[EpisodeBatch] = []
+        self._number = np.zeros(env.num_envs, np.int64)  # of the running episodes
+        self._begun = 0
+        self.parameters_from = 0
+        self._cohorts = Cohorts(env.num_envs)
+
+    def set_parameters(self, parameters: Mapping[str, ParameterValue]) -> None:
+        """Sets environment parameters; they are those of all episodes that begin from now on.
+
+        An environment draws them anew at its resets, which are where its episodes end. So all
+        episodes from the number `parameters_from` on have them, and none before.
+
+        Raises:
+            ValueError: the environment has no such parameter.
+        """
+        self.env.set_parameters(parameters)
+        self.parameters_from = self._begun
 
     def reset(self) -> None:
         """Begins an episode everywhere."""
         self.observations, _ = self.env.reset()
+        self._begin(np.ones(self.env.num_envs, bool))
         self._check_observations(self.observations)
 
     def step(self, actions: NDArray[Any]) -> Step:
@@ -160,22 +128,31 @@ class EnvRunner:
         )
 
     def pop_finished(self) -> EpisodeBatch:
-        """The episodes that ended since the last call."""
-        parts, self._finished = self._finished, []
-        return concatenate(parts)
+        """The finished episodes of the cohorts that were completed since the last call.
+
+        They come in the order in which they began; see `Cohorts` for why.
+        """
+        return self._cohorts.pop(int(self._number.min()))
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on exactly; asked for when no finished episode waits."""
+        """Everything needed to go on exactly."""
         return {
             "env": self.env.state_dict(),
             "step_count": self.step_count,
             "reward": self._reward.copy(),
             "length": self._length.copy(),
             "terms": {name: values.copy() for name, values in self._terms.items()},
+            "number": self._number.copy(),
+            "begun": self._begun,
+            "parameters_from": self.parameters_from,
+            "cohorts": self._cohorts.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes back to a state.
+
+        One that was saved before episodes had numbers does not say which parameters those that run
+        were begun with: the first to have the present ones are those that follow them.
 
         Raises:
             ValueError: it is the state of another number of environments.
@@ -188,7 +165,19 @@ class EnvRunner:
         self.step_count = state["step_count"]
         self._reward, self._length = state["reward"].copy(), state["length"].copy()
         self._terms = {name: values.copy() for name, values in state["terms"].items()}
-        self._finished = []
+        count = self.env.num_envs
+        self._number = np.array(state.get("number", np.arange(count)))
+        self._begun = state.get("begun", count)
+        self.parameters_from = state.get("parameters_from", count)
+        self._cohorts = Cohorts(count)
+        if "cohorts" in state:
+            self._cohorts.load_state_dict(state["cohorts"])
+
+    def _begin(self, where: NDArray[np.bool_]) -> None:
+        """Numbers the episodes that begin in some environments (N,)."""
+        count = int(where.sum())
+        self._number[where] = self._begun + np.arange(count)
+        self._begun += count
 
     def _add_up(
         self,
@@ -202,8 +191,9 @@ class EnvRunner:
         for name, values in terms.items():
             self._terms[name] = self._terms.get(name, 0.0) + values
         if done.any():
-            self._finished.append(
+            self._cohorts.add(
                 EpisodeBatch(
+                    self._number[done],
                     self._reward[done],
                     self._length[done],
                     {name: total[done] for name, total in self._terms.items()},
@@ -212,6 +202,7 @@ class EnvRunner:
             )
             for total in (self._reward, self._length, *self._terms.values()):
                 total[done] = 0.0
+            self._begin(done)
 
     def _check_observations(
         self, observations: Mapping[str, NDArray[Any]], of: NDArray[np.bool_] | None = None

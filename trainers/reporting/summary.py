@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from trainers.common.averager import Averager
-from trainers.experience.env_runner import SUCCESS, EpisodeBatch
+from trainers.experience.episodes import SUCCESS, EpisodeBatch
 from trainers.experience.frames import frame_spaces
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.images import picture
@@ -73,13 +73,13 @@ class Summary:
         """Remembers the newest checkpoint, for status.json."""
         self._checkpoint = str(path)
 
-    def report(self, session: Session, progress: TerminalDisplay) -> None:
+    def report(self, session: Session, display: TerminalDisplay) -> None:
         """Writes a summary if one is due, and shows the terminal where the run stands."""
         step = session.env_runner.step_count
         if step >= self._next_summary:
             self._next_summary = (step // self._summary_freq + 1) * self._summary_freq
             self._summarize(session, step)
-            progress.update(self._line(session, step))
+            display.update(self._line(session, step))
 
     def status(self, session: Session, state: str) -> None:
         """Rewrites status.json.

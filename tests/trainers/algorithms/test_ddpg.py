@@ -17,7 +17,8 @@ from torch import Tensor
 
 from trainers.algorithms.ddpg import DDPG, DDPGHyperparameters, DDPGSettings
 from trainers.common.errors import UserError
-from trainers.experience.env_runner import EnvRunner, NonFiniteError, concatenate
+from trainers.experience.env_runner import EnvRunner, NonFiniteError
+from trainers.experience.episodes import concatenate
 from trainers.networks.deterministic import DeterministicPolicy, DeterministicSettings
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.frame_features import FrameFeatures

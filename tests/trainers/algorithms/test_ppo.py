@@ -25,7 +25,8 @@ from trainers.algorithms.ppo import (
     clipped_value_loss,
     surrogate_loss,
 )
-from trainers.experience.env_runner import EnvRunner, NonFiniteError, concatenate
+from trainers.experience.env_runner import EnvRunner, NonFiniteError
+from trainers.experience.episodes import concatenate
 from trainers.networks.distributions import Categorical, DiagonalGaussian
 from trainers.networks.factory import NetworkFactory
 from trainers.session import Session

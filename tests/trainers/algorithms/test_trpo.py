@@ -30,7 +30,8 @@ from trainers.algorithms.trpo import (
     line_search,
     surrogate_gain,
 )
-from trainers.experience.env_runner import EnvRunner, NonFiniteError, concatenate
+from trainers.experience.env_runner import EnvRunner, NonFiniteError
+from trainers.experience.episodes import concatenate
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Categorical, DiagonalGaussian, Distribution
 from trainers.networks.factory import NetworkFactory

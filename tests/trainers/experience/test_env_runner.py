@@ -14,10 +14,8 @@ from encoders.spaces import RgbImage
 from envs.environment import EnvironmentFailure
 from trainers.experience.env_runner import (
     EnvRunner,
-    EpisodeBatch,
     NonFiniteError,
     StopRequested,
-    concatenate,
 )
 
 SPACE = gymnasium.spaces.Dict({"x": Box(-np.inf, np.inf, (1,), np.float32), "eye": RgbImage(2, 2)})
@@ -51,7 +49,8 @@ def test_episodes_are_added_up_over_resets(scripted: Any) -> None:
     for _ in range(4):
         env_runner.step(ACTIONS)
     episodes = env_runner.pop_finished()
-    # In the order they ended: the first env's steps 1-2, the second's 1-3, then 3-4 and 4.
+    # In the order they began: the first env's steps 1-2, the second's 1-3, then 3-4 and 4.
+    assert episodes.number.tolist() == [0, 1, 2, 3]
     assert episodes.rewards.tolist() == [1 + 2, 10 + 20 + 40, 4 + 8, 80]
     assert episodes.lengths.tolist() == [2, 3, 2, 1]
     assert episodes.terms["near"].tolist() == [0.75, 17.5, 3.0, 20.0]
@@ -65,18 +64,18 @@ def test_episodes_are_added_up_over_resets(scripted: Any) -> None:
 def test_finished_episodes_are_taken_once(scripted: Any) -> None:
     env_runner = begun(script(scripted))
     assert len(env_runner.pop_finished()) == 0
-    for expected in ([], [3.0], [70.0], [12.0, 80.0], []):
+    for expected in ([], [], [3.0, 70.0], [12.0, 80.0], []):
         env_runner.step(ACTIONS)
         assert env_runner.pop_finished().rewards.tolist() == expected
 
 
 def test_environments_that_report_nothing_have_no_terms_and_no_success(scripted: Any) -> None:
     env_runner = begun(script(scripted, terms=None, episode_metrics=None))
-    for _ in range(2):
+    for _ in range(3):
         env_runner.step(ACTIONS)
     episodes = env_runner.pop_finished()
     assert episodes.terms == episodes.episode_metrics == {}
-    assert episodes.successes.tolist() == [False]
+    assert episodes.successes.tolist() == [False, False]
 
 
 def test_a_step_says_what_the_environment_said(scripted: Any) -> None:
@@ -224,18 +223,58 @@ def test_going_back_to_a_state_goes_on_with_the_same_books(scripted: Any) -> Non
     np.testing.assert_equal(state, kept)
 
 
-def some_episodes(*rewards: float) -> EpisodeBatch:
-    values = np.array(rewards)
-    return EpisodeBatch(values, values + 1, {"near": values + 2}, {"success": values > 1})
+class Parameterized:
+    """Stands in for an environment that takes parameters."""
+
+    def __init__(self, env: Any):
+        self.env, self.parameters = env, []
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.env, name)
+
+    def set_parameters(self, parameters: Any) -> None:
+        self.parameters.append(parameters)
 
 
-def test_episodes_are_joined_and_chosen() -> None:
-    empty = EpisodeBatch(np.zeros(0), np.zeros(0), {}, {})
-    joined = concatenate([empty, some_episodes(1.0, 2.0), empty, some_episodes(3.0)])
-    assert joined.rewards.tolist() == [1.0, 2.0, 3.0]
-    assert joined.terms["near"].tolist() == [3.0, 4.0, 5.0]
-    assert joined.successes.tolist() == [False, True, True]
-    chosen = joined[np.array([True, False, True])]
-    assert chosen.lengths.tolist() == [2.0, 4.0]
-    assert chosen.episode_metrics["success"].tolist() == [False, True]
-    assert len(concatenate([])) == len(concatenate([empty])) == 0
+def test_parameters_are_those_of_the_episodes_that_begin_after_them(scripted: Any) -> None:
+    env: Any = Parameterized(script(scripted))
+    env_runner = EnvRunner(env)
+    env_runner.set_parameters({"scale": 1.0})
+    assert env_runner.parameters_from == 0
+    env_runner.reset()
+    for _ in range(2):
+        env_runner.step(ACTIONS)
+    env_runner.set_parameters({"scale": 2.0})
+    assert env.parameters == [{"scale": 1.0}, {"scale": 2.0}]
+    assert env_runner.parameters_from == 3  # 1 and 2 run, 3 begins with the next step
+    state = env_runner.state_dict()
+    env_runner.step(ACTIONS)
+    env_runner.set_parameters({"scale": 3.0})
+    assert env_runner.parameters_from == 4
+    other = EnvRunner(script(scripted))
+    other.load_state_dict(state)
+    assert other.parameters_from == 3
+
+
+def test_episodes_that_a_reset_cuts_off_keep_nothing_waiting(scripted: Any) -> None:
+    env_runner = begun(script(scripted))
+    env_runner.step(ACTIONS)
+    env_runner.reset()
+    for _ in range(3):
+        env_runner.step(ACTIONS)
+    assert env_runner.pop_finished().number.tolist() == [2, 3]
+
+
+def test_a_state_from_before_episodes_had_numbers_goes_on(scripted: Any) -> None:
+    env_runner = begun(script(scripted))
+    env_runner.step(ACTIONS)
+    state = env_runner.state_dict()
+    for name in ("number", "begun", "parameters_from", "cohorts"):
+        del state[name]
+    other = EnvRunner(script(scripted))
+    other.load_state_dict(state)
+    assert other.parameters_from == 2  # how the running ones were begun is not known
+    for _ in range(2):
+        other.step(ACTIONS)
+    episodes = other.pop_finished()
+    assert (episodes.number.tolist(), episodes.rewards.tolist()) == ([0, 1], [3.0, 70.0])

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from trainers import evaluation
 from trainers.evaluation import evaluate
-from trainers.experience.env_runner import concatenate
+from trainers.experience.episodes import concatenate
 from trainers.networks.recurrent import MemorySettings, Recurrent, Sequences, number_sequences
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings, SettingsError

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trainers.experience.env_runner import EpisodeBatch
+from trainers.experience.episodes import EpisodeBatch
 from trainers.reporting.summary import Summary, measure_tag
 from trainers.reporting.terminal import RunStatus
 from trainers.session import Session
@@ -57,7 +57,8 @@ def report(summary: Summary, session: Session, step: int) -> Display:
 def episodes(rewards: list[float], **episode_metrics: list[float]) -> EpisodeBatch:
     values = np.array(rewards)
     arrays = {name: np.array(numbers) for name, numbers in episode_metrics.items()}
-    return EpisodeBatch(values, 10 * values, {"near": values / 2, "far": values / 4}, arrays)
+    terms = {"near": values / 2, "far": values / 4}
+    return EpisodeBatch(np.arange(len(values)), values, 10 * values, terms, arrays)
 
 
 def test_episodes_weigh_alike_however_they_arrive(make_session: MakeSession) -> None:
