@@ -14,12 +14,15 @@ State = dict[str, Any]
 
 @dataclass(frozen=True)
 class FinishedEpisodes:
-    """The episodes that ended since the curriculum was last asked to advance.
+    """Episodes of the current lesson that ended, each shown once.
+
+    They were all reset with the lesson's own parameters. Their order is that in which they began,
+    without gaps, so that the first n, or n in a row, are like any others: no short ones first.
 
     Attributes:
-        rewards: (k,) cumulative reward of each, in the order in which they ended.
+        rewards: (k,) cumulative reward of each, in the order in which they began.
         successes: (k,) whether each ended in success.
-        progress: Training steps done over the run's ``max_steps``, in [0, 1].
+        run_fraction: Training steps done over the run's ``max_steps``, in [0, 1].
 
     Raises:
         ValueError: The arrays are not (k,) both, or a reward is not finite.
@@ -27,7 +30,7 @@ class FinishedEpisodes:
 
     rewards: NDArray[np.floating]
     successes: NDArray[np.bool_]
-    progress: float
+    run_fraction: float
 
     def __post_init__(self) -> None:
         if self.rewards.ndim != 1 or self.rewards.shape != self.successes.shape:
@@ -61,6 +64,10 @@ class Curriculum(Protocol):
 
     def lesson(self, state: State) -> int:
         """Return the index of the current lesson, from 0."""
+        ...
+
+    def lesson_name(self, state: State) -> str | None:
+        """Return what the log calls the current lesson next to its number, if anything."""
         ...
 
     def parameters(self, state: State) -> dict[str, ParameterValue]:

@@ -14,7 +14,7 @@ class LessonSettings(BaseModel, frozen=True, extra="forbid"):
     """One lesson of a curriculum that is written lesson by lesson."""
 
     name: str | None = Field(
-        default=None, min_length=1, description="Name of the lesson in the log."
+        default=None, min_length=1, description="Name of the lesson in the log, next to its number."
     )
     threshold: FiniteFloat | None = Field(
         default=None,
@@ -32,12 +32,12 @@ class Lesson:
     """A lesson worked out in full.
 
     Attributes:
-        name: What the log calls it.
+        name: What the log calls it next to its number; None if it has none.
         threshold: What the measure must pass to end it; None for the last lesson.
         parameters: Every environment parameter that the curriculum sets.
     """
 
-    name: str
+    name: str | None
     threshold: float | None
     parameters: dict[str, ParameterValue]
 
@@ -142,10 +142,9 @@ class LessonsSettings(BaseModel, frozen=True, extra="forbid"):
             return self._expand_compact_form()
         expanded: list[Lesson] = []
         parameters: dict[str, ParameterValue] = {}
-        for number, lesson in enumerate(self.lessons, start=1):
+        for lesson in self.lessons:
             parameters = parameters | lesson.parameters
-            name = lesson.name or _default_name(number, len(self.lessons))
-            expanded.append(Lesson(name, lesson.threshold, parameters))
+            expanded.append(Lesson(lesson.name, lesson.threshold, parameters))
         return tuple(expanded)
 
     def _expand_compact_form(self) -> tuple[Lesson, ...]:
@@ -155,17 +154,9 @@ class LessonsSettings(BaseModel, frozen=True, extra="forbid"):
             thresholds = (*self.thresholds.values(count - 1), None)
         rows = {name: ends.values(count) for name, ends in (self.parameters or {}).items()}
         return tuple(
-            Lesson(
-                _default_name(index + 1, count),
-                thresholds[index],
-                {name: row[index] for name, row in rows.items()},
-            )
+            Lesson(None, thresholds[index], {name: row[index] for name, row in rows.items()})
             for index in range(count)
         )
-
-
-def _default_name(number: int, count: int) -> str:
-    return f"{number} of {count}"
 
 
 def _check_progress_thresholds(thresholds: list[float]) -> None:

@@ -33,8 +33,8 @@ class Lessons:
 
     The measures `reward` and `success` are smoothed: the mean over the latest episodes of the
     lesson must stay over its threshold for a number of consecutive episodes. Each lesson starts
-    with no episodes, and those that end in the same call after a lesson has ended count for
-    nothing, because they were played under it. With `progress` a lesson ends as soon as the
+    with no episodes, and those of a call that are left when a lesson ends count for nothing,
+    because they were played under it. With `progress` a lesson ends as soon as the
     fraction of max_steps is over its threshold; one call can then pass several.
 
     The state holds the lesson's index (`lesson`), the latest values (`window`, up to
@@ -64,7 +64,7 @@ class Lessons:
         """
         index = self.lesson(state)
         if self._settings.measure == "progress":
-            return _begin(self._pass_thresholds(index, episodes.progress))
+            return _begin(self._pass_thresholds(index, episodes.run_fraction))
         threshold = self._lessons[index].threshold
         if threshold is None:
             return _begin(index)  # nothing will ever be asked of the last lesson's episodes
@@ -86,8 +86,8 @@ class Lessons:
             )
         return index
 
-    def lesson_name(self, state: State) -> str:
-        """Return what the log calls the current lesson: its own name, or "3 of 19"."""
+    def lesson_name(self, state: State) -> str | None:
+        """Return what the log calls the current lesson next to its number, if anything."""
         return self._lessons[self.lesson(state)].name
 
     def parameters(self, state: State) -> dict[str, ParameterValue]:
@@ -98,8 +98,10 @@ class Lessons:
         """Return the environment parameters of the last lesson."""
         return dict(self._lessons[-1].parameters)
 
-    def _pass_thresholds(self, index: int, progress: float) -> int:
-        while (threshold := self._lessons[index].threshold) is not None and progress > threshold:
+    def _pass_thresholds(self, index: int, run_fraction: float) -> int:
+        while (
+            threshold := self._lessons[index].threshold
+        ) is not None and run_fraction > threshold:
             index += 1
         return index
 

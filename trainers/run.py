@@ -64,14 +64,14 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
         start = session.env_runner.step_count
         with (
             closing(RunLog(directory, start if resumed else None)) as log,
-            make_display(run_id, settings.max_steps, session.lesson_count, start) as progress,
+            make_display(run_id, settings.max_steps, session.lesson_count, start) as display,
             _timers_written(directory),
         ):
             log.text("configuration", f"```yaml\n{dump_yaml(run)}```", start)
             for note in resumed.notes if resumed else ():
-                progress.message(note)
+                display.message(note)
             summary = Summary(log, run_id, settings.max_steps, settings.summary_freq, start)
-            return _train(session, settings, summary, checkpoints, progress)
+            return _train(session, settings, summary, checkpoints, display)
 
 
 @contextmanager
@@ -90,15 +90,15 @@ def _train(
     settings: TrainerSettings,
     summary: Summary,
     checkpoints: Checkpoints,
-    progress: TerminalDisplay,
+    display: TerminalDisplay,
 ) -> bool:
     """Trains, and leaves the run's state in status.json however it ends."""
     state = "failed"
     try:
-        finished = train(session, settings, summary, checkpoints, progress)
+        finished = train(session, settings, summary, checkpoints, display)
         state = "finished" if finished else "interrupted"
         if not finished:
-            progress.message("stopped and saved; go on with --resume")
+            display.message("stopped and saved; go on with --resume")
         return finished
     except NonFiniteError as error:
         raise NonFiniteError(f"{error}; {_last_good(checkpoints)}") from error

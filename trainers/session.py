@@ -79,6 +79,13 @@ class Session:
         """Lessons of the curriculum; 1 without one."""
         return 1 if self.curriculum is None else self.curriculum.lesson_count
 
+    @property
+    def lesson_title(self) -> str:
+        """The present lesson for people: "lesson 3 of 19", and its name if it has one."""
+        title = f"lesson {self.lesson + 1} of {self.lesson_count}"
+        name = self.curriculum and self.curriculum.lesson_name(self._curriculum_state)
+        return f"{title} ({name})" if name else title
+
     def reset(self) -> None:
         """Begins the run's first episodes."""
         self.env_runner.reset()

@@ -20,7 +20,7 @@ def train(
     settings: TrainerSettings,
     summary: Summary,
     checkpoints: Checkpoints,
-    progress: TerminalDisplay,
+    display: TerminalDisplay,
 ) -> bool:
     """Trains until the steps are used up or a stop is requested; what was learned is saved.
 
@@ -50,12 +50,9 @@ def train(
         episodes = env_runner.pop_finished()
         summary.add_episodes(episodes)
         if session.advance_curriculum(episodes, env_runner.step_count / max_steps):
-            progress.message(
-                f"step {env_runner.step_count}: lesson {session.lesson + 1} of "
-                f"{session.lesson_count} begins"
-            )
+            display.message(f"step {env_runner.step_count}: {session.lesson_title} begins")
         with timed("summary"):
-            summary.report(session, progress)
+            summary.report(session, display)
         if env_runner.step_count - saved_at >= settings.checkpoint_interval:
             saved_at = env_runner.step_count
             path = _save(session, checkpoints, saved_at, session.state_dict(), summary.score)

@@ -164,6 +164,16 @@ def test_episodes_that_were_begun_in_a_lesson_count_for_no_other(
     assert session.env_runner.parameters_from == 4  # as many as have begun
 
 
+def test_a_lesson_has_a_title_with_its_name(make_session: MakeSession) -> None:
+    named = copy.deepcopy(LESSONS)
+    named["lessons"][1]["name"] = "narrow"  # type: ignore[index]
+    session = make_session("target", curriculum=named)
+    assert session.lesson_title == "lesson 1 of 3"
+    session.advance_curriculum(episodes(1.0, 1.0), 0.1)
+    assert session.lesson_title == "lesson 2 of 3 (narrow)"
+    assert make_session("target").lesson_title == "lesson 1 of 1"
+
+
 def test_lessons_of_progress_see_the_runs(make_session: MakeSession) -> None:
     lessons = {**LESSONS, "measure": "progress", "lessons": copy.deepcopy(LESSONS["lessons"])}
     del lessons["smoothing_episodes"], lessons["min_lesson_length"]

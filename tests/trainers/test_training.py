@@ -288,9 +288,11 @@ def test_numbers_that_are_not_finite_save_nothing_new(
 
 
 def test_a_new_lesson_is_announced(training: Callable[..., Training]) -> None:
-    one = training(curriculum=LESSONS)  # 4 episodes a collection: the ninth is in the third
+    wide, narrow = LESSONS["lessons"]  # type: ignore[misc]
+    named = {**LESSONS, "lessons": [wide, {**narrow, "name": "fine"}]}  # type: ignore[dict-item]
+    one = training(curriculum=named)  # 4 episodes a collection: the ninth is in the third
     one.train()
-    assert one.quiet.messages == ["step 48: lesson 2 of 2 begins"]
+    assert one.quiet.messages == ["step 48: lesson 2 of 2 (fine) begins"]
 
 
 def test_a_finished_run_taken_up_again_is_finished_at_once(

@@ -66,21 +66,21 @@ class Schedule(BaseModel, frozen=True, extra="forbid"):
             )
         return given
 
-    def value(self, initial: float, progress: float) -> float:
+    def value(self, initial: float, run_fraction: float) -> float:
         """Return the scheduled value.
 
         Args:
             initial: The value at the start of the run.
-            progress: The fraction of the run that is over; clamped to [0, 1].
+            run_fraction: The fraction of the run that is over; clamped to [0, 1].
         """
-        progress = min(max(progress, 0.0), 1.0)
+        run_fraction = min(max(run_fraction, 0.0), 1.0)
         if self.final_fraction is None:
             return initial
         if self.type == "exponential":
-            # initial * final_fraction ** progress
-            return initial * self.final_fraction**progress
-        # final + (initial - final) * (1 - progress) ** power, in the form exact at both ends
-        weight = (1 - progress) ** (1.0 if self.power is None else self.power)
+            # initial * final_fraction ** run_fraction
+            return initial * self.final_fraction**run_fraction
+        # final + (initial - final) * (1 - run_fraction) ** power, in the form exact at both ends
+        weight = (1 - run_fraction) ** (1.0 if self.power is None else self.power)
         return initial * weight + initial * self.final_fraction * (1 - weight)
 
 

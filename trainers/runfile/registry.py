@@ -30,7 +30,14 @@ BUILT_IN_PLUGINS = (
     "envs.plugin",
     "trainers.plugin",
 )
-CURRICULUM_METHODS = ("initial_state", "advance", "lesson", "parameters", "final_parameters")
+CURRICULUM_METHODS = (
+    "initial_state",
+    "advance",
+    "lesson",
+    "lesson_name",
+    "parameters",
+    "final_parameters",
+)
 
 
 @dataclass(frozen=True)

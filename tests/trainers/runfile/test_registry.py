@@ -63,7 +63,8 @@ class GoodEncoder(nn.Module):
 
 class GoodCurriculum:
     Settings = Empty
-    initial_state = advance = lesson = parameters = final_parameters = lambda self: None
+    initial_state = advance = lesson = lesson_name = lambda self: None
+    parameters = final_parameters = lambda self: None
 
 
 class GoodEnvironment(Environment):
@@ -186,12 +187,15 @@ def call(self: Any) -> None: ...
         (
             "curricula",
             component("C", Settings=Empty, initial_state=call, advance=call, lesson=call),
-            "C has no method parameters",
+            "C has no method lesson_name",
         ),
         (
             "curricula",
             component(
-                "C", Settings=Empty, initial_state=call, advance=call, lesson=call, parameters=call
+                "C",
+                Settings=Empty,
+                **dict.fromkeys(("initial_state", "advance", "lesson"), call),
+                **dict.fromkeys(("lesson_name", "parameters"), call),
             ),
             "C has no method final_parameters",
         ),

@@ -68,7 +68,8 @@ class Conv(nn.Module):
 
 
 class Steps:
-    initial_state = advance = lesson = parameters = final_parameters = lambda self: None
+    initial_state = advance = lesson = lesson_name = lambda self: None
+    parameters = final_parameters = lambda self: None
 
     class Settings(Model):
         count: int = 1
