@@ -49,7 +49,7 @@ class EpisodeBatch:
 
 
 def concatenate(parts: Sequence[EpisodeBatch]) -> EpisodeBatch:
-    """EpisodeBatch of several batches, in their order."""
+    """Episodes of several batches, in their order."""
     parts = [part for part in parts if len(part)]
     if not parts:
         return EpisodeBatch(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), {}, {})
