@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import gymnasium
-import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from curricula.samplers import ParameterValue
+from envs.evaluation import EvaluationOption, Evaluator
 from rewards.reward import RewardTerm
 
 Observations = dict[str, NDArray[Any]]
@@ -22,41 +22,6 @@ StepResult = tuple[Observations, NDArray[Any], NDArray[Any], NDArray[Any], dict[
 
 class EnvironmentFailure(RuntimeError):  # noqa: N818 - gymnasium's Error says something else
     """An environment broke down, through no fault of the run file: a process died, for instance."""
-
-
-class PhysicalCheck(Protocol):
-    """Carries out actions in a world with full physics, apart from the episodes."""
-
-    def __call__(self, actions: NDArray[Any]) -> dict[str, NDArray[np.bool_]]:
-        """Tries out actions (n, ...) in the first n environments, whose episodes do not notice.
-
-        Returns:
-            By name (n,): `success`, and each reason of failure; one of them is true of every row.
-        """
-
-    def close(self) -> None:
-        """Frees what it holds; calling it twice does no harm."""
-
-
-class EvaluationReport(Protocol):
-    """Pictures of a policy's actions, for people to look at.
-
-    Attributes:
-        file_names: what `files` makes.
-    """
-
-    file_names: tuple[str, ...]
-
-    def add(self, actions: NDArray[Any], outcomes: Mapping[str, NDArray[np.bool_]]) -> None:
-        """Takes up actions (n, ...) in the first n environments, before they are carried out.
-
-        Args:
-            actions: those of the policy.
-            outcomes: what the physical check says of them; empty where there was none.
-        """
-
-    def files(self) -> Iterator[tuple[str, bytes]]:
-        """Draws everything: names and contents of files."""
 
 
 class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
@@ -81,8 +46,10 @@ class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         snapshot: the type of what its rewards are computed from; its constructor gives the rewards
             to `rewards.reward.fitting`, which refuses those for another one.
         parameter_names: the environment parameters that curricula and samplers may set.
-        privileged: names of the observations that only a critic may see.
+        privileged: names of observations that only a critic may see: a policy does not, unless the
+            run file says so. They may be of the class or of the instance.
         evaluation_episodes: how many an evaluation plays unless it is told otherwise.
+        evaluation_options: what `trainers.evaluate` offers for it, next to its own options.
     """
 
     Settings: ClassVar[type[BaseModel]]
@@ -90,6 +57,7 @@ class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     parameter_names: ClassVar[frozenset[str]] = frozenset()
     privileged: frozenset[str] = frozenset()
     evaluation_episodes: ClassVar[int] = 100
+    evaluation_options: ClassVar[tuple[EvaluationOption, ...]] = ()
     single_observation_space: gymnasium.spaces.Dict
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
@@ -117,21 +85,6 @@ class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         """Goes back to a state; returns the observations it was left with."""
         raise NotImplementedError
 
-    def physical_check(self, *, window: bool = False) -> PhysicalCheck:
-        """What evaluation tries out first actions in; an environment need not have it.
-
-        Args:
-            window: show it, as it goes.
-
-        Raises:
-            ValueError: it can't be had as asked for.
-        """
-        raise ValueError("it has no physical check")
-
-    def album(self) -> EvaluationReport:
-        """What evaluation has its pictures from; an environment need not have it.
-
-        Raises:
-            ValueError: it can't be had: something is not installed, perhaps.
-        """
-        raise ValueError("it has no pictures to show")
+    def evaluator(self) -> Evaluator:
+        """How policies are judged here; an environment that has nothing to add keeps this one."""
+        return Evaluator()

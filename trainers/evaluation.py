@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from torch import nn
 
 from curricula.samplers import ParameterValue
-from envs.environment import Environment, EvaluationReport, PhysicalCheck
+from envs.environment import Environment
+from envs.evaluation import EvaluationReport, PhysicalCheck
 from trainers.algorithms.base import Algorithm
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner
@@ -86,10 +87,10 @@ def evaluate(
         count = episodes or env.evaluation_episodes
         if pick:
             with _asked_for("--pick"):
-                check = stack.enter_context(closing(env.physical_check(window=window)))
+                check = stack.enter_context(closing(env.evaluator().physical_check(window=window)))
         if render is not None:
             with _asked_for("--render"):
-                album = env.album()
+                album = env.evaluator().pictures()
             gallery = EvaluationFolder(
                 Path(render) if render else folder / EVALUATION, album.file_names
             )

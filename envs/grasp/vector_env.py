@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from curricula.samplers import ParameterValue, draw
 from encoders.spaces import DepthImage
 from envs.environment import Environment, Observations, StepResult
+from envs.evaluation import EvaluationOption
 from envs.grasp.episode_state import RunningEpisodes
-from envs.grasp.evaluation.pick import PickCheck, Picker
+from envs.grasp.evaluation.evaluator import EVALUATION_OPTIONS, GraspEvaluator
 from envs.grasp.evaluation.pose_commands import PoseCommands
-from envs.grasp.evaluation.report import GraspReport
 from envs.grasp.observations import PRIVILEGED, observation_space, privileged_state
 from envs.grasp.scene.sampler import Scenes, SceneSampler
 from envs.grasp.sensors.camera import CameraPoses, overviews
@@ -52,6 +52,7 @@ class GraspVectorEnv(Environment):
         {*GOAL_PARAMETERS, "noise_sigma_m", "block_yaw_limit_deg"}
     )
     evaluation_episodes: ClassVar[int] = 1000
+    evaluation_options: ClassVar[tuple[EvaluationOption, ...]] = EVALUATION_OPTIONS
     metadata: dict[str, Any] = {  # noqa: RUF012
         "autoreset_mode": AutoresetMode.SAME_STEP,
         "render_modes": ["human", "rgb_array"],
@@ -157,14 +158,9 @@ class GraspVectorEnv(Environment):
 
     # -- evaluation's interface ------------------------------------------------------------------
 
-    def physical_check(self, *, window: bool = False) -> PickCheck:
-        """The pick; see `Environment.physical_check` and `envs.grasp.evaluation.pick`."""
-        picker = Picker(self._settings.support, self._settings.pick, window)
-        return PickCheck(picker, self._pose_commands)
-
-    def album(self) -> GraspReport:
-        """See `Environment.album`."""
-        return GraspReport(self._settings, self._pose_commands)
+    def evaluator(self) -> GraspEvaluator:
+        """See `Environment.evaluator`."""
+        return GraspEvaluator(self._settings, self._pose_commands)
 
     # -- the task --------------------------------------------------------------------------------
 

@@ -215,3 +215,13 @@ def test_equal_seeds_begin_alike_and_others_do_not(make_session: MakeSession) ->
     np.testing.assert_array_equal(goal, again.env_runner.observations["goal"])
     assert not np.array_equal(goal, other.env_runner.observations["goal"])
     assert any(not torch.equal(t, other.weights()[name]) for name, t in first.weights().items())
+
+
+def test_what_the_environment_keeps_for_critics_is_not_shown_to_the_policy(
+    make_session: MakeSession,
+) -> None:
+    network = {"critic": "separate", "critic_observations": ["goal", "privileged"]}
+    session = make_session({"type": "target", "privileged": True}, {"network_settings": network})
+    policy = session.algorithm.policy
+    assert set(policy.actor.vector_encoders) == {"goal"}
+    assert set(policy.critic.vector_encoders) == {"goal", "privileged"}

@@ -31,7 +31,7 @@ class ActorCriticSettings(NetworkSettings, frozen=True, extra="forbid"):
     """Networks of an actor and a critic, and what each of them sees."""
 
     actor_observations: tuple[str, ...] | None = Field(
-        None, description="What the policy sees; null: every observation but `privileged`."
+        None, description="What the policy sees; null: all but those kept for a critic."
     )
     critic_observations: tuple[str, ...] | None = Field(
         None, description="What a separate critic sees; null: what the policy sees."

@@ -144,7 +144,7 @@ class Picker:
 
 
 class PickCheck:
-    """Picks at the commands of actions. Implements `envs.environment.PhysicalCheck`.
+    """Picks at the commands of actions. Implements `envs.evaluation.PhysicalCheck`.
 
     Args:
         picker: carries them out; it is closed with this.

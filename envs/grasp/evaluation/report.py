@@ -22,7 +22,7 @@ NEEDED = ("matplotlib", "PIL")
 
 
 class GraspReport:
-    """Draws commands. Implements `envs.environment.EvaluationReport`.
+    """Draws commands. Implements `envs.evaluation.EvaluationReport`.
 
     Args:
         settings: the task.

@@ -162,7 +162,7 @@ def test_the_environment_picks_without_its_episodes_noticing(simulator: str) -> 
         actions = env.action_for(tooltip, scenes.target_yaw_rad)
         actions[1, 3] = -np.sign(actions[1, 3])  # as wrong a yaw as there is
         before = env.state_dict()
-        check = env.physical_check()
+        check = env.evaluator().physical_check()
         outcomes = check(actions[:2])
         check.close()
         check.close()

@@ -50,7 +50,7 @@ def outcomes(*, success: int) -> dict[str, np.ndarray]:
 
 
 def test_errors_are_those_to_the_middle_of_the_goal_region(env: GraspVectorEnv) -> None:
-    album = env.album()
+    album = env.evaluator().pictures()
     album.add(actions(env, ahead=-0.025, up=0.004, yaw_deg=-3.0), outcomes(success=1))
     (judged,) = album._judged
     # The region's gap goes from 10 to 20 mm.
@@ -64,7 +64,7 @@ def test_errors_are_those_to_the_middle_of_the_goal_region(env: GraspVectorEnv) 
 
 @pytest.mark.parametrize("checked", [True, False])
 def test_all_files_are_drawn_and_can_be_opened(env: GraspVectorEnv, checked: bool) -> None:
-    album = env.album()
+    album = env.evaluator().pictures()
     found = outcomes(success=ENVS) if checked else {}
     for _ in range(2):
         album.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), found)
@@ -79,7 +79,7 @@ def test_all_files_are_drawn_and_can_be_opened(env: GraspVectorEnv, checked: boo
 def test_the_film_goes_on_to_the_pick_only_where_there_is_one(env: GraspVectorEnv) -> None:
     lengths_ms = []
     for found in ({}, outcomes(success=ENVS)):
-        album = env.album()
+        album = env.evaluator().pictures()
         album.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), found)
         content = film(album._shots[:1], Support(), Pick(), bool(found))
         with Image.open(io.BytesIO(content)) as image:
@@ -100,7 +100,7 @@ def test_the_cup_is_drawn_where_the_camera_would_see_it(
         "matplotlib.axes.Axes.plot",
         lambda self, u, v, color, **_: lines.append((u, v)) if color == AIM_COLOR else None,
     )
-    album = env.album()
+    album = env.evaluator().pictures()
     album.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), {})
     shot = album._shots[0]
     contact_sheet([shot], np.zeros(3))
@@ -117,7 +117,7 @@ def test_an_rgb_camera_alone_will_do() -> None:
     env = make_vector_env(1, simulator="fast", cameras={"top": Camera(type="rgb")})
     try:
         env.reset()
-        album = env.album()
+        album = env.evaluator().pictures()
         album.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), {})
         assert next(iter(album.files()))[1].startswith(b"\x89PNG")
     finally:
@@ -132,4 +132,4 @@ def test_without_matplotlib_the_message_says_what_to_install(
         importlib.util, "find_spec", lambda name: None if name == "matplotlib" else find_spec(name)
     )
     with pytest.raises(ValueError, match=r"matplotlib.*\[render\]"):
-        env.album()
+        env.evaluator().pictures()

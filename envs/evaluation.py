@@ -1,0 +1,175 @@
+"""The contract of evaluation: what an environment declares of how its policies are judged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+PERCENT = "%"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One number that a policy is judged by, made of a metric of many episodes.
+
+    Attributes:
+        metric: a key of the infos' `episode_metrics`.
+        label: what people call it.
+        key: its name in reports, in the metric's own unit; empty: the metric's name.
+        unit: what people read it in.
+        scale: from the metric's own unit to that one.
+        better: which way is better; None where neither is.
+        summary: `mean` for rates, `quantiles` (median and 95th percentile) for errors.
+    """
+
+    metric: str
+    label: str
+    key: str = ""
+    unit: str = ""
+    scale: float = 1.0
+    better: Literal["higher", "lower"] | None = "higher"
+    summary: Literal["mean", "quantiles"] = "mean"
+
+    @property
+    def name(self) -> str:
+        """The key in reports."""
+        return self.key or self.metric
+
+    def of_first_action(self) -> Figure:
+        """The same figure, of a policy's first action alone."""
+        return replace(self, key=f"first_action_{self.name}", label=f"first action {self.label}")
+
+    def summarize(self, values: NDArray[Any]) -> float | dict[str, float]:
+        """What a report says of the metric (k,) of k episodes."""
+        if self.summary == "mean":
+            return float(np.mean(values))
+        return {"median": float(np.median(values)), "p95": float(np.percentile(values, 95))}
+
+    def shown(self, value: float) -> str:
+        """A value as people read it: `98.5%`, `2.41 mm`, `-0.163`."""
+        if self.unit == PERCENT:
+            return f"{value * self.scale:.1f}%"
+        return f"{value * self.scale:.2f} {self.unit}" if self.unit else f"{value * self.scale:.3f}"
+
+
+def rate(
+    metric: str, label: str, key: str = "", better: Literal["higher", "lower"] = "higher"
+) -> Figure:
+    """The share of episodes that something is true of."""
+    return Figure(metric, label, key, PERCENT, 100.0, better)
+
+
+def error(metric: str, label: str, unit: str, scale: float = 1.0) -> Figure:
+    """A distance from what is wanted, in the metric's unit times `scale`."""
+    return Figure(metric, label, "", unit, scale, "lower", "quantiles")
+
+
+SUCCESS = rate("success", "success")
+"""What every environment may report, and need not declare."""
+
+
+class PhysicalCheck(Protocol):
+    """Carries out actions in a world with full physics, apart from the episodes."""
+
+    def __call__(self, actions: NDArray[Any]) -> dict[str, NDArray[np.bool_]]:
+        """Tries out actions (n, ...) in the first n environments, whose episodes do not notice.
+
+        Returns:
+            By name (n,): `success`, and each reason of failure; one of them is true of every row.
+        """
+
+    def close(self) -> None:
+        """Frees what it holds; calling it twice does no harm."""
+
+
+class EvaluationReport(Protocol):
+    """Pictures of a policy's actions, for people to look at.
+
+    Attributes:
+        file_names: what `files` makes.
+    """
+
+    file_names: tuple[str, ...]
+
+    def add(self, actions: NDArray[Any], outcomes: Mapping[str, NDArray[np.bool_]]) -> None:
+        """Takes up actions (n, ...) in the first n environments, before they are carried out.
+
+        Args:
+            actions: those of the policy.
+            outcomes: what the physical check says of them; empty where there was none.
+        """
+
+    def files(self) -> Iterator[tuple[str, bytes]]:
+        """Draws everything: names and contents of files."""
+
+
+class Evaluator:
+    """How an environment's policies are judged. What is not declared is left out.
+
+    Attributes:
+        figures: of the environment's episode metrics. Success needs no declaration.
+        judges_first_action: the deterministic policy's first action is judged by itself, and the
+            whole episodes are played as at the end of training, exploration and all; otherwise
+            the deterministic policy plays them.
+        check_name: what reports call the physical check.
+    """
+
+    figures: tuple[Figure, ...] = ()
+    judges_first_action: bool = False
+    check_name: str = "check"
+
+    def physical_check(self, *, window: bool = False) -> PhysicalCheck:
+        """What first actions are tried out in.
+
+        Args:
+            window: show it, as it goes.
+
+        Raises:
+            ValueError: there is none, or it can't be had as asked for.
+        """
+        raise ValueError("the environment has no physical check")
+
+    def pictures(self) -> EvaluationReport:
+        """What draws first actions.
+
+        Raises:
+            ValueError: there is nothing to draw, or something needed for it is not installed.
+        """
+        raise ValueError("the environment has no pictures to show")
+
+
+@dataclass(frozen=True)
+class RunFileOption:
+    """An option of evaluation's command line that stands for a key of the run file.
+
+    Attributes:
+        flag: such as `--track`.
+        help: for the command line's `--help`.
+        key: the dotted path, such as `environment.track`.
+    """
+
+    flag: str
+    help: str
+    key: str
+
+
+@dataclass(frozen=True)
+class PhysicalCheckOption:
+    """An option of evaluation's command line that asks for the physical check.
+
+    Attributes:
+        flag: such as `--drive`.
+        help: for the command line's `--help`.
+        window: show it, as it goes.
+    """
+
+    flag: str
+    help: str
+    window: bool = False
+
+
+EvaluationOption = RunFileOption | PhysicalCheckOption

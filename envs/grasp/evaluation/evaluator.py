@@ -1,0 +1,61 @@
+"""How policies that grasp are judged: by their first action, by picks, and by pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from numpy.typing import NDArray
+
+from envs.evaluation import (
+    EvaluationOption,
+    Evaluator,
+    PhysicalCheckOption,
+    RunFileOption,
+    error,
+    rate,
+)
+from envs.grasp.evaluation.pick import PickCheck, Picker
+from envs.grasp.evaluation.pose_commands import PoseCommands
+from envs.grasp.evaluation.report import GraspReport
+from envs.grasp.settings import GraspSettings
+
+MM_PER_M = 1000.0
+EVALUATION_OPTIONS: tuple[EvaluationOption, ...] = (
+    RunFileOption("--simulator", "overrides `environment.simulator`", "environment.simulator"),
+    PhysicalCheckOption("--pick", "have the robot pick up the block, in PyBullet"),
+    PhysicalCheckOption("--window", "pick before your eyes, in PyBullet's window", window=True),
+)
+
+
+class GraspEvaluator(Evaluator):
+    """Judges commanded poses. See `Evaluator`.
+
+    Args:
+        settings: the task.
+        commands: where actions would lead in the running episodes.
+    """
+
+    figures = (
+        rate("collision", "collision rate", key="collision_rate", better="lower"),
+        error("position_error_m", "position error", "mm", MM_PER_M),
+        *(
+            error(f"position_error_{axis}_m", f"position error {axis}", "mm", MM_PER_M)
+            for axis in "xyz"
+        ),
+        error("yaw_error_deg", "yaw error", "deg"),
+    )
+    judges_first_action = True
+    check_name = "pick"
+
+    def __init__(self, settings: GraspSettings, commands: Callable[[NDArray[Any]], PoseCommands]):
+        self._settings, self._pose_commands = settings, commands
+
+    def physical_check(self, *, window: bool = False) -> PickCheck:
+        """The pick; see `envs.grasp.evaluation.pick`."""
+        picker = Picker(self._settings.support, self._settings.pick, window)
+        return PickCheck(picker, self._pose_commands)
+
+    def pictures(self) -> GraspReport:
+        """Scenes, errors and a film; see `envs.grasp.evaluation.report`."""
+        return GraspReport(self._settings, self._pose_commands)
