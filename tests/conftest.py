@@ -6,7 +6,7 @@ The helpers are handed out by fixtures, because a `conftest` can't be imported r
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from pydantic import BaseModel
 
 from encoders.spaces import DepthImage
 from envs.environment import Environment
+from envs.evaluation import Evaluator, PhysicalCheckOption, RunFileOption, error, rate
 from rewards.reward import RewardTerm
 from trainers import run as run_module
 from trainers.algorithms.ppo import PPO
@@ -83,6 +84,8 @@ class ToyEnvironment(Environment):
     def distance(self, actions: np.ndarray, target: np.ndarray) -> np.ndarray: ...
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[dict[str, Any], dict]:
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
         self._begin(np.ones(self.num_envs, bool))
         return self._observations(), {}
 
@@ -152,6 +155,70 @@ class TargetEnvironment(ToyEnvironment):
 
     def distance(self, actions: np.ndarray, target: np.ndarray) -> np.ndarray:
         return np.linalg.norm(actions - target, axis=1)
+
+
+class DartsEnvironment(TargetEnvironment):
+    """Hit the point, and be judged as a third party's environment may be: by all there is."""
+
+    evaluation_episodes = 10
+    evaluation_options = (
+        RunFileOption("--darts", "how many (100% of them thrown)", "environment.episode_steps"),
+        PhysicalCheckOption("--throw", "throw real darts"),
+        PhysicalCheckOption("--watch", "throw them before your eyes", window=True),
+    )
+
+    def step(self, actions: np.ndarray) -> tuple[Any, ...]:
+        *results, infos = super().step(actions)
+        metrics = infos["episode_metrics"]
+        metrics["inside"] = metrics["distance_m"] < 1.0
+        return *results, infos
+
+    def evaluator(self) -> DartsEvaluator:
+        return DartsEvaluator()
+
+
+class DartsEvaluator(Evaluator):
+    figures = (
+        rate("inside", "darts on the board", key="inside_rate"),
+        error("distance_m", "distance", "cm", 100.0),
+    )
+    judges_first_action = True
+    check_name = "throw"
+
+    def physical_check(self, *, window: bool = False) -> Throw:
+        if window:
+            raise ValueError("it is too dark to see anything")
+        return Throw()
+
+    def pictures(self) -> Board:
+        return Board()
+
+
+class Throw:
+    """Darts to the right stick, others fall off."""
+
+    def __call__(self, actions: np.ndarray) -> dict[str, np.ndarray]:
+        right = actions[:, 0] > 0.0
+        return {"success": right, "fell_off": ~right}
+
+    def close(self) -> None:
+        pass
+
+
+class Board:
+    """Draws the number of darts, and how many stuck."""
+
+    file_names = ("board.txt",)
+
+    def __init__(self) -> None:
+        self.darts = self.stuck = 0
+
+    def add(self, actions: np.ndarray, outcomes: Mapping[str, np.ndarray]) -> None:
+        self.darts += len(actions)
+        self.stuck += int(sum(outcomes.get("success", [])))
+
+    def files(self) -> Iterator[tuple[str, bytes]]:
+        yield "board.txt", f"{self.stuck} of {self.darts}".encode()
 
 
 class ChoiceEnvironment(ToyEnvironment):
@@ -299,6 +366,7 @@ class ToyPlugin:
     def ventosa_environments(self) -> dict[str, type]:
         return {
             "target": TargetEnvironment,
+            "darts": DartsEnvironment,
             "choice": ChoiceEnvironment,
             "recall": RecallEnvironment,
             "picture": PictureEnvironment,

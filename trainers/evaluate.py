@@ -5,107 +5,185 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
-from trainers.common.errors import UserError
+from envs.evaluation import EvaluationOption, Figure, RunFileOption
+from trainers.common.errors import UserError, suggestion
 from trainers.common.files import write_atomically
-from trainers.evaluation import evaluate
+from trainers.evaluation import Evaluation, evaluate, find_run
 from trainers.learn import DONE, MISTAKE
+from trainers.runfile.settings import Component
 
-UNITS = {
-    "position_error_m": ("mm", 1000.0),
-    "yaw_error_deg": ("deg", 1.0),
-    "pick_failures": ("%", 100.0),
-}
-RATES = (
-    "success",
-    "collision_rate",
-    "first_action_success",
-    "first_action_collision_rate",
-    "pick_rate",
-)
+PROGRAM = "python -m trainers.evaluate"
+HEADER = ("episodes", "seed")
+"""Entries of a report that are the table's title."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluates a policy; returns the exit code."""
-    options = parse(arguments)
     try:
-        report = evaluate(
+        options = parse(sys.argv[1:] if arguments is None else arguments)
+        evaluation = evaluate(
             options.policy,
             episodes=options.episodes,
             seed=options.seed,
-            overrides=[f"environment.simulator={options.simulator}"] if options.simulator else [],
+            overrides=options.overrides,
             results_dir=options.results_dir,
-            pick=options.pick or options.window,
+            check=options.check,
             window=options.window,
             render=options.render,
         )
-        text = json.dumps(report, indent=2)
         if options.json is not None:
-            try:
-                write_atomically(options.json, text + "\n")
-            except OSError as error:
-                raise UserError(f"{options.json}: can't be written: {error.strerror}") from error
+            _write(options.json, evaluation.report)
     except UserError as mistake:
         print(f"error: {mistake}", file=sys.stderr)
         return MISTAKE
-    Console().print(table(options.policy, report))
+    Console().print(table(options.policy, evaluation))
     return DONE
 
 
-def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Reads the command line."""
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """Reads the command line; the policy's environment has options of its own.
+
+    Returns:
+        The options; `overrides` has those that stand for keys of the run file, too, and `check` and
+        `window` say whether a physical check is asked for, and is to be seen.
+
+    Raises:
+        UserError: there is no such policy, or no such option.
+    """
+    generic = _generic_options()
+    known, rest = generic.parse_known_args(arguments)
+    policy = next((word for word in rest if not word.startswith("-")), None)
+    environment = None if policy is None else _environment(policy, known.results_dir)
+    offered = () if environment is None else environment.cls.evaluation_options
     parser = argparse.ArgumentParser(
-        prog="python -m trainers.evaluate",
+        prog=PROGRAM,
         description="Report how good a policy is, on scenes never used for training.",
+        parents=[generic],
+        epilog=None if policy else "POLICY --help lists the options of its environment, too.",
     )
     parser.add_argument("policy", help="a run (its best checkpoint) or a checkpoint's folder")
+    parser.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="KEY=VALUE",
+        help="a dotted path into the run's file, such as environment.num_envs=16",
+    )
+    if environment is not None:
+        _add_options(parser, environment)
+    options, unknown = parser.parse_known_intermixed_args(arguments)
+    if unknown:
+        _refuse(unknown, [*_flags(known), *(option.flag for option in offered)])
+    return _resolved(options, offered)
+
+
+def _generic_options() -> argparse.ArgumentParser:
+    """What every environment's policies can be evaluated with."""
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM, usage=f"{PROGRAM} POLICY [KEY=VALUE ...] [options]", add_help=False
+    )
     parser.add_argument("--episodes", type=_positive, help="how many (default: the environment's)")
     parser.add_argument("--seed", type=_not_negative, default=0, help="of the scenes")
-    parser.add_argument("--simulator", help="overrides `environment.simulator`")
-    parser.add_argument(
-        "--pick", action="store_true", help="have the robot pick up the block, in PyBullet"
-    )
-    parser.add_argument(
-        "--window", action="store_true", help="pick before your eyes, in PyBullet's window"
-    )
     parser.add_argument(
         "--render",
         nargs="?",
         const="",
         metavar="DIR",
-        help="draw episodes, errors and a film into DIR (default: evaluation/ in the run's folder)",
+        help="draw pictures into DIR (default: evaluation/ in the run's folder)",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here, too")
     parser.add_argument(
         "--results-dir", type=Path, default=Path("results"), help="where runs are kept"
     )
-    return parser.parse_args(arguments)
+    return parser
 
 
-def table(name: str, report: dict[str, Any]) -> Table:
+def _environment(policy: str, results_dir: Path) -> Component:
+    run, *_ = find_run(policy, (), results_dir)
+    return run.environment
+
+
+def _add_options(parser: argparse.ArgumentParser, environment: Component) -> None:
+    """Adds what an environment offers."""
+    group = parser.add_argument_group(f"options of the environment {environment.name!r}")
+    for option in environment.cls.evaluation_options:
+        takes: dict[str, Any] = {"action": "store_true"}
+        if isinstance(option, RunFileOption):
+            takes = {"metavar": "VALUE"}
+        # Kept under its flag as it stands, where no option of evaluation's own can be in its way.
+        about = {"dest": option.flag, "help": option.help.replace("%", "%%")}
+        try:
+            group.add_argument(option.flag, **about, **takes)
+        except argparse.ArgumentError as error:
+            raise UserError(
+                f"the environment {environment.name!r} offers an option that there is already: "
+                f"{option.flag}"
+            ) from error
+
+
+def _resolved(
+    options: argparse.Namespace, offered: Sequence[EvaluationOption]
+) -> argparse.Namespace:
+    """The options, with what those of the environment mean in the place of them."""
+    options.check = options.window = False
+    for option in offered:
+        given = vars(options)[option.flag]
+        if isinstance(option, RunFileOption):
+            options.overrides += [] if given is None else [f"{option.key}={given}"]
+        elif given:
+            options.check, options.window = True, options.window or option.window
+    return options
+
+
+def _flags(options: argparse.Namespace) -> list[str]:
+    return ["--help", *(f"--{name.replace('_', '-')}" for name in vars(options))]
+
+
+def _refuse(unknown: Sequence[str], flags: Sequence[str]) -> None:
+    """Names the options that come nearest.
+
+    Raises:
+        UserError: always.
+    """
+    flag = next(word for word in unknown if word.startswith("-")).partition("=")[0]
+    raise UserError(f"unknown option {flag}; {suggestion(flag, flags)}")
+
+
+def table(name: str, evaluation: Evaluation) -> Table:
     """The figures for people."""
+    report = evaluation.report
     result = Table(title=f"{name}: {report['episodes']} episodes, seed {report['seed']}")
     result.add_column("figure")
     result.add_column("value", justify="right")
+    result.add_column("better")
     for key, value in report.items():
-        if key in ("episodes", "seed") or value is None:
+        if key in HEADER:
             continue
-        if isinstance(value, dict):
-            unit, factor = UNITS[key]
-            for part, number in value.items():
-                label = f"{key.rsplit('_', 1)[0]}, {part}".replace("_", " ")
-                result.add_row(label, f"{number * factor:.2f} {unit}")
-        elif key in RATES:
-            result.add_row(key.replace("_", " "), f"{value:.1%}")
-        else:
-            result.add_row(key.replace("_", " "), f"{value:.3f}")
+        plain = Figure(key, key.replace("_", " "), better=None)
+        for row in _rows(evaluation.figures.get(key, plain), value):
+            result.add_row(*row)
     return result
+
+
+def _rows(figure: Figure, value: float | dict[str, float]) -> Iterator[tuple[str, str, str]]:
+    """A report's entry, or its parts: what it is called, the value, and which way is better."""
+    parts = value.items() if isinstance(value, dict) else [("", value)]
+    for part, number in parts:
+        label = f"{figure.label}, {part}".replace("_", " ") if part else figure.label
+        yield label, figure.shown(number), figure.better or ""
+
+
+def _write(path: Path, report: dict[str, Any]) -> None:
+    try:
+        write_atomically(path, json.dumps(report, indent=2) + "\n")
+    except OSError as error:
+        raise UserError(f"{path}: can't be written: {error.strerror}") from error
 
 
 def _positive(text: str) -> int:

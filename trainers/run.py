@@ -70,7 +70,8 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
             log.text("configuration", f"```yaml\n{dump_yaml(run)}```", start)
             for note in resumed.notes if resumed else ():
                 display.message(note)
-            summary = Summary(log, run_id, settings.max_steps, settings.summary_freq, start)
+            env = session.env_runner.env
+            summary = Summary(log, run_id, env, settings.max_steps, settings.summary_freq, start)
             return _train(session, settings, summary, checkpoints, display)
 
 
@@ -106,7 +107,7 @@ def _train(
         saved = checkpoints.list_checkpoints()
         if saved:
             summary.note_checkpoint(saved[-1].path)
-        summary.status(session, state)
+        summary.status(session.position, state)
 
 
 def _last_good(checkpoints: Checkpoints) -> str:

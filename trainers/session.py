@@ -19,6 +19,7 @@ from trainers.experience.episodes import EpisodeBatch
 from trainers.inference.construction import network_factory
 from trainers.inference.metadata import Metadata
 from trainers.networks.factory import NetworkFactory
+from trainers.reporting.summary import RunPosition
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import Component, RunSettings
 
@@ -85,6 +86,12 @@ class Session:
         title = f"lesson {self.lesson + 1} of {self.lesson_count}"
         name = self.curriculum and self.curriculum.lesson_name(self._curriculum_state)
         return f"{title} ({name})" if name else title
+
+    @property
+    def position(self) -> RunPosition:
+        """How far the run has come."""
+        lesson = None if self.curriculum is None else self.lesson
+        return RunPosition(self.env_runner.step_count, lesson, self.lesson_count)
 
     def reset(self) -> None:
         """Begins the run's first episodes."""

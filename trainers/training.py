@@ -52,7 +52,7 @@ def train(
         if session.advance_curriculum(episodes, env_runner.step_count / max_steps):
             display.message(f"step {env_runner.step_count}: {session.lesson_title} begins")
         with timed("summary"):
-            summary.report(session, display)
+            summary.report(session.position, env_runner.observations, display)
         if env_runner.step_count - saved_at >= settings.checkpoint_interval:
             saved_at = env_runner.step_count
             path = _save(session, checkpoints, saved_at, session.state_dict(), summary.score)

@@ -85,7 +85,8 @@ class Ventosa:
             self.session = stack.enter_context(closing(Session(run, load_registries())))
             log = stack.enter_context(closing(RunLog(folder)))
             self.session.reset()
-            self._summary = Summary(log, "speed", 1, self._settings.summary_freq)
+            env = self.session.env_runner.env
+            self._summary = Summary(log, "speed", env, 1, self._settings.summary_freq)
             self._checkpoints = _NoCheckpoints(folder, 1)
             self._display = make_display("speed", 1, 1, console=Console(quiet=True))
             self.close = stack.pop_all().close

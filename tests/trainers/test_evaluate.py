@@ -9,12 +9,14 @@ from typing import Any
 
 import pytest
 
+from envs.evaluation import PhysicalCheckOption
 from envs.grasp.evaluation.report import GraspReport
 from trainers import evaluation
 from trainers.common.errors import UserError
 from trainers.evaluate import main
 from trainers.runfile.registry import Registries
 from trainers.saving.evaluation_folder import REPORT, EvaluationFolder
+from trainers.saving.run_folder import find_checkpoint
 
 GRASP: dict[str, Any] = {
     "type": "grasp",
@@ -37,7 +39,7 @@ def evaluate(
     monkeypatch.setattr(evaluation, "load_registries", lambda: registries)
 
     def run(environment: Any, *arguments: Any) -> tuple[int, str, Path]:
-        learned = learn(write_run(environment))
+        learned = learn(write_run(environment), "--force")
         assert learned.code == 0, learned.errors
         results = learned.results
         report = results / "report.json"
@@ -60,15 +62,128 @@ def test_an_environment_without_measures_is_evaluated_by_its_rewards(
     assert "pick_rate" not in report
 
 
-@pytest.mark.parametrize("option", ["--pick", "--window", "--render"])
-def test_what_an_environment_can_not_show_is_told(
-    evaluate: Callable[..., Any], option: str
-) -> None:
-    code, errors, results = evaluate("target", option)
+def test_what_an_environment_can_not_show_is_told(evaluate: Callable[..., Any]) -> None:
+    code, errors, results = evaluate("target", "--render")
     assert code == 2
-    assert ("--pick: " if option == "--window" else f"{option}: ") in errors
-    assert "Traceback" not in errors
+    assert errors == "error: --render: the environment has no pictures to show\n"
     assert not (results / "toy" / "evaluation").exists()
+
+
+class TestAThirdPartysEnvironment:
+    """Its figures, check, pictures and options are its own affair: darts, in conftest.py."""
+
+    def test_has_its_figures_in_the_report_and_in_the_table(
+        self, evaluate: Callable[..., Any], capfd: pytest.CaptureFixture[str]
+    ) -> None:
+        code, _, results = evaluate("darts")
+        assert code == 0
+        assert main([str(results / "toy"), "--episodes", "6"]) == 0
+        printed = capfd.readouterr().out
+        report = json.loads((results / "report.json").read_text())
+        assert list(report) == [
+            *("episodes", "seed", "success", "inside_rate", "reward", "reward_std"),
+            *("episode_length", "first_action_success", "first_action_inside_rate", "distance_m"),
+        ]
+        assert set(report["distance_m"]) == {"median", "p95"}
+        for row in (
+            f"darts on the board {report['inside_rate']:.1%} higher",
+            f"first action darts on the board {report['first_action_inside_rate']:.1%} higher",
+            f"distance, median {report['distance_m']['median'] * 100:.2f} cm lower",
+            f"distance, p95 {report['distance_m']['p95'] * 100:.2f} cm lower",
+        ):
+            assert row in " ".join(printed.replace("│", " ").split())
+
+    def test_has_a_best_checkpoint_and_is_judged_by_it(self, evaluate: Callable[..., Any]) -> None:
+        code, _, results = evaluate("darts")
+        assert code == 0
+        best = json.loads((results / "toy" / "checkpoints" / "best.json").read_text())
+        found = find_checkpoint("toy", results)
+        assert found.path.name == best["checkpoint"]
+        assert 0.0 <= best["score"] <= 1.0  # the success rate, which is reported here
+
+    def test_is_checked_and_drawn(self, evaluate: Callable[..., Any]) -> None:
+        code, _, results = evaluate("darts", "--throw", "--render")
+        assert code == 0
+        report = json.loads((results / "report.json").read_text())
+        assert set(report["throw_failures"]) == {"fell_off"}
+        assert report["throw_rate"] + report["throw_failures"]["fell_off"] == 1.0
+        stuck = round(6 * report["throw_rate"])
+        folder = results / "toy" / "evaluation"
+        assert (folder / "board.txt").read_text() == f"{stuck} of 6"
+
+    def test_can_refuse_to_be_watched(self, evaluate: Callable[..., Any]) -> None:
+        code, errors, _ = evaluate("darts", "--watch")
+        assert code == 2
+        assert errors == "error: the throw: it is too dark to see anything\n"
+
+    def test_has_options_that_stand_for_keys_of_the_run_file(
+        self, evaluate: Callable[..., Any]
+    ) -> None:
+        lengths = []
+        for arguments in ((), ("--darts", "3"), ("environment.episode_steps=5",)):
+            code, errors, results = evaluate("darts", *arguments)
+            assert code == 0, errors
+            report = json.loads((results / "report.json").read_text())
+            lengths.append(report["episode_length"])
+        assert lengths == [4.0, 3.0, 5.0]
+
+
+def test_help_lists_the_environments_own_options(
+    evaluate: Callable[..., Any], capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as leaving:
+        evaluate("darts", "--help")
+    assert leaving.value.code == 0
+    told = capfd.readouterr().out
+    for text in ("'darts'", "--darts VALUE", "100% of them", "--throw", "--watch", "KEY=VALUE"):
+        assert text in told
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    told = capfd.readouterr().out
+    assert "--throw" not in told
+    assert "--render" in told
+
+
+@pytest.mark.parametrize(
+    ("environment", "option", "told"),
+    [
+        ("darts", "--trow", "unknown option --trow; did you mean '--throw'?"),
+        ("darts", "--dart5=3", "unknown option --dart5; did you mean '--darts'?"),
+        ("target", "--throw", "unknown option --throw; known: --episodes, --help, --json"),
+        ("target", "--results_dir=x", "unknown option --results_dir; did you mean '--results-dir'"),
+        ("target", "environment.episode_step=3", "did you mean 'episode_steps'?"),
+        ("target", "nonsense", "KEY=VALUE"),
+    ],
+)
+def test_an_unknown_option_names_the_nearest(
+    evaluate: Callable[..., Any], environment: str, option: str, told: str
+) -> None:
+    code, errors, _ = evaluate(environment, option)
+    assert code == 2
+    assert told in errors
+    assert "Traceback" not in errors
+
+
+def test_an_option_may_come_before_the_policy(evaluate: Callable[..., Any], tmp_path: Path) -> None:
+    _, _, results = evaluate("darts")
+    report = tmp_path / "other.json"
+    assert main(["--seed", "1", "--json", str(report), str(results / "toy"), "--throw"]) == 0
+    assert "throw_rate" in json.loads(report.read_text())
+
+
+def test_an_option_that_there_is_already_is_the_environments_mistake(
+    evaluate: Callable[..., Any], registries: Registries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clash = (PhysicalCheckOption("--seed", "of a plant"),)
+    monkeypatch.setattr(registries.environments.get("darts").cls, "evaluation_options", clash)
+    code, errors, _ = evaluate("darts")
+    assert code == 2
+    assert "'darts' offers an option that there is already: --seed" in errors
+
+
+def test_a_policy_that_is_not_there_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["nowhere", "--throw"]) == 2
+    assert "nowhere: neither a run nor a checkpoint" in capsys.readouterr().err
 
 
 def test_picks_are_counted_and_drawn(evaluate: Callable[..., Any]) -> None:

@@ -103,7 +103,7 @@ def test_episodes_of_gymnasium_are_played_by_the_deterministic_policy(
     # Of a number that is a with probability p and b else: |a - b| sqrt(p (1 - p)).
     share = (length - 2) / 2
     assert said["reward_std"] == pytest.approx(18 * (share * (1 - share)) ** 0.5)
-    printed = capsys.readouterr().out
+    printed = " ".join(capsys.readouterr().out.split())
     for fact in (f"{said['reward']:.3f}", "reward std", f"{said['reward_std']:.3f}", "30 episodes"):
         assert fact in printed
 
@@ -140,6 +140,8 @@ def ages(monkeypatch: pytest.MonkeyPatch) -> list[list[float]]:
 
     monkeypatch.setattr(ActorCritic, "initial_state", lambda policy, count: torch.zeros(count, 1))
     monkeypatch.setattr(ActorCritic, "act", count_steps)
+    one = property(lambda policy: 1, lambda policy, size: None)
+    monkeypatch.setattr(ActorCritic, "state_size", one, raising=False)
     return ages
 
 
@@ -147,9 +149,7 @@ def test_what_is_remembered_ends_with_its_episode(
     saved: Callable[..., Path], ages: list[list[float]]
 ) -> None:
     report(saved(GYMNASIUM), "--episodes", "40")
-    first_action, *steps = ages
-    assert first_action == [0.0, 0.0]
-    for column in np.array(steps).T:
+    for column in np.array(ages).T:
         begins = np.flatnonzero(column == 0.0)
         lengths = np.diff(begins)
         assert set(lengths) == set(LENGTHS)
@@ -178,7 +178,8 @@ def test_grasping_is_judged_by_the_first_action_and_by_episodes_as_in_training(
     said = report(saved(GRASP, rewards=REWARDS, encoders=ENCODERS), "--episodes", "3")
     facts = {"episodes", "seed"}
     first_actions = {"first_action_success", "first_action_collision_rate"}
-    errors = {"position_error_m", "yaw_error_deg"}
+    axes = {f"position_error_{axis}_m" for axis in "xyz"}
+    errors = {"position_error_m", *axes, "yaw_error_deg"}
     episodes = {"success", "collision_rate", "reward", "reward_std", "episode_length"}
     assert said.keys() == facts | first_actions | errors | episodes
 
@@ -186,5 +187,5 @@ def test_grasping_is_judged_by_the_first_action_and_by_episodes_as_in_training(
 def test_a_setting_that_the_environment_lacks_is_the_users_mistake(
     saved: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([str(saved(GYMNASIUM)), "--simulator", "fast"]) == 2
+    assert main([str(saved(GYMNASIUM)), "environment.simulator=fast"]) == 2
     assert "environment.simulator: unknown key" in capsys.readouterr().err

@@ -76,7 +76,8 @@ class Training:
 
     def train(self) -> bool:
         quiet: Any = self.quiet
-        summary = Summary(quiet, "run", self.settings.max_steps, self.settings.summary_freq)
+        env, settings = self.session.env_runner.env, self.settings
+        summary = Summary(quiet, "run", env, settings.max_steps, settings.summary_freq)
         return train(self.session, self.settings, summary, self.checkpoints, quiet)
 
 

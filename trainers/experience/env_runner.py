@@ -85,9 +85,9 @@ class EnvRunner:
         self.env.set_parameters(parameters)
         self.parameters_from = self._begun
 
-    def reset(self) -> None:
-        """Begins an episode everywhere."""
-        self.observations, _ = self.env.reset()
+    def reset(self, seed: int | None = None) -> None:
+        """Begins an episode everywhere; a seed says which ones."""
+        self.observations, _ = self.env.reset(seed=seed)
         self._begin(np.ones(self.env.num_envs, bool))
         self._check_observations(self.observations)
 

@@ -1,4 +1,4 @@
-"""Camera frames of a collection: each kept once, and encoded once."""
+"""Frames of a collection: each kept once, and encoded once."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A policy by itself: loaded from a folder, asked for actions.
 
-policy = Policy.load("policies/grasp")
-actions, state = policy.predict({"depth": image})
+policy = Policy.load("results/run")
+actions, state = policy.predict({"image": image})
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class Policy:
         """The state (B, m) as a tensor."""
         if state is None:
             return self.network.initial_state(count)
-        rows = np.asarray(state, np.float32).reshape(-1, np.shape(state)[-1])
+        rows = np.atleast_2d(np.asarray(state, np.float32))
         if rows.shape != (count, self.network.state_size):
             raise ValueError(
                 f"state: of shape {np.shape(state)}, where {count} observations need "

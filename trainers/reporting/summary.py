@@ -3,22 +3,40 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from envs.environment import Environment
+from envs.evaluation import Figure
 from trainers.common.averager import Averager
 from trainers.experience.episodes import SUCCESS, EpisodeBatch
 from trainers.experience.frames import frame_spaces
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.images import picture
 from trainers.reporting.terminal import RunStatus, TerminalDisplay
-from trainers.session import Session
 
-MEASURE_TAGS = {"success": "Success Rate", "collision": "Collision Rate"}
+SUCCESS_TAG = "Environment/Success Rate"
 SUMMARIES_PER_PICTURE = 10
+
+
+@dataclass(frozen=True)
+class RunPosition:
+    """How far a run has come.
+
+    Attributes:
+        step: environment steps taken.
+        lesson: the present lesson, from 0; None without a curriculum.
+        lesson_count: lessons of the curriculum; 1 without one.
+    """
+
+    step: int
+    lesson: int | None = None
+    lesson_count: int = 1
 
 
 class Summary:
@@ -27,6 +45,7 @@ class Summary:
     Args:
         log: TensorBoard and status.json.
         run_id: the run's name.
+        env: what is observed, and how its figures are called.
         max_steps: steps of the whole run.
         summary_freq: steps between two summaries.
         start_step: steps the run had when this process took it up.
@@ -37,8 +56,16 @@ class Summary:
     """
 
     def __init__(
-        self, log: RunLog, run_id: str, max_steps: int, summary_freq: int, start_step: int = 0
+        self,
+        log: RunLog,
+        run_id: str,
+        env: Environment,
+        max_steps: int,
+        summary_freq: int,
+        start_step: int = 0,
     ):
+        self._frame_spaces = frame_spaces(env.single_observation_space)
+        self._figures = env.evaluator().figures
         self._log, self._run_id, self._max_steps = log, run_id, max_steps
         self._summary_freq, self._start_step = summary_freq, start_step
         self._averager = Averager()
@@ -63,7 +90,7 @@ class Summary:
             "Environment/Episode Length": episodes.lengths.mean(),
             **{f"Reward/{name}": total.mean() for name, total in episodes.terms.items()},
             **{
-                measure_tag(name): values.mean()
+                metric_tag(name, self._figures): values.mean()
                 for name, values in episodes.episode_metrics.items()
             },
         }
@@ -73,22 +100,32 @@ class Summary:
         """Remembers the newest checkpoint, for status.json."""
         self._checkpoint = str(path)
 
-    def report(self, session: Session, display: TerminalDisplay) -> None:
-        """Writes a summary if one is due, and shows the terminal where the run stands."""
-        step = session.env_runner.step_count
-        if step >= self._next_summary:
-            self._next_summary = (step // self._summary_freq + 1) * self._summary_freq
-            self._summarize(session, step)
-            display.update(self._line(session, step))
+    def report(
+        self,
+        position: RunPosition,
+        observations: Mapping[str, NDArray[Any]],
+        display: TerminalDisplay,
+    ) -> None:
+        """Writes a summary if one is due, and shows the terminal where the run stands.
 
-    def status(self, session: Session, state: str) -> None:
+        Args:
+            position: how far the run has come.
+            observations: by name (N, ...), the present ones, of which images are shown at times.
+            display: the terminal.
+        """
+        if position.step >= self._next_summary:
+            self._next_summary = (position.step // self._summary_freq + 1) * self._summary_freq
+            self._summarize(position, observations)
+            display.update(self._line(position))
+
+    def status(self, position: RunPosition, state: str) -> None:
         """Rewrites status.json.
 
         Args:
-            session: the run.
+            position: how far the run has come.
             state: `running`, `finished`, `interrupted` or `failed`.
         """
-        line = self._line(session, session.env_runner.step_count)
+        line = self._line(position)
         self._log.status(
             {
                 "run_id": self._run_id,
@@ -96,7 +133,7 @@ class Summary:
                 "step": line.step,
                 "max_steps": self._max_steps,
                 "lesson": line.lesson + 1,
-                "lessons": session.lesson_count,
+                "lessons": position.lesson_count,
                 "reward": line.reward,
                 "success": line.success,
                 "steps_per_second": line.steps_per_second,
@@ -105,48 +142,51 @@ class Summary:
             }
         )
 
-    def _summarize(self, session: Session, step: int) -> None:
+    def _summarize(self, position: RunPosition, observations: Mapping[str, NDArray[Any]]) -> None:
+        step = position.step
         now = time.monotonic()
         means = self._averager.pop_means()
         if step > self._summary_step:
             speed = (step - self._summary_step) / max(now - self._summary_s, 1e-9)
             means["Performance/Steps Per Second"] = speed
-        if session.curriculum is not None:
-            means["Environment/Lesson Number/lesson"] = session.lesson + 1
+        if position.lesson is not None:
+            means["Environment/Lesson Number/lesson"] = position.lesson + 1
         self._summary_s, self._summary_step = now, step
         self._log.scalars(means, step)
         if self._summaries % SUMMARIES_PER_PICTURE == 0:
-            self._show_observations(session, step)
+            self._show_observations(observations, step)
         self._summaries += 1
         self._last |= means
         success, reward = self._last_success(), self._last.get("Environment/Cumulative Reward")
-        self.score = reward if success is None else session.lesson + success
-        self.status(session, "running")
+        self.score = reward if success is None else (position.lesson or 0) + success
+        self.status(position, "running")
 
-    def _show_observations(self, session: Session, step: int) -> None:
-        env_runner = session.env_runner
-        spaces: Any = env_runner.env.single_observation_space
-        for name, space in frame_spaces(spaces).items():
-            frame = np.asarray(env_runner.observations[name][0])
+    def _show_observations(self, observations: Mapping[str, NDArray[Any]], step: int) -> None:
+        for name, space in self._frame_spaces.items():
+            frame = np.asarray(observations[name][0])
             self._log.images(f"Observations/{name}", picture(space, frame), step)
 
-    def _line(self, session: Session, step: int) -> RunStatus:
+    def _line(self, position: RunPosition) -> RunStatus:
+        step = position.step
         elapsed_s = time.monotonic() - self._start_s
         overall = (step - self._start_step) / max(elapsed_s, 1e-9)
         left_s = (self._max_steps - step) / overall if overall > 0 else None
         return RunStatus(
             step=step,
             reward=self._last.get("Environment/Cumulative Reward"),
-            lesson=session.lesson,
+            lesson=position.lesson or 0,
             success=self._last_success(),
             steps_per_second=self._last.get("Performance/Steps Per Second"),
             seconds_left=None if left_s is None else max(left_s, 0.0),
         )
 
     def _last_success(self) -> float | None:
-        return self._last.get(measure_tag(SUCCESS))
+        return self._last.get(SUCCESS_TAG)
 
 
-def measure_tag(name: str) -> str:
-    """The TensorBoard tag of an episode's measure."""
-    return f"Environment/{MEASURE_TAGS.get(name, name.replace('_', ' ').title())}"
+def metric_tag(metric: str, figures: Sequence[Figure]) -> str:
+    """The TensorBoard tag of an episode metric: its figure's name, or its own where it has none."""
+    if metric == SUCCESS:
+        return SUCCESS_TAG
+    name = next((figure.name for figure in figures if figure.metric == metric), metric)
+    return f"Environment/{name.replace('_', ' ').title()}"

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from envs.evaluation import error, rate
+from envs.grasp.evaluation.evaluator import GraspEvaluator
 from trainers.experience.episodes import EpisodeBatch
-from trainers.reporting.summary import Summary, measure_tag
+from trainers.reporting.summary import Summary, metric_tag
 from trainers.reporting.terminal import RunStatus
 from trainers.session import Session
 
@@ -43,14 +45,17 @@ class Display:
         self.lines.append(line)
 
 
-def summary_of(log: Log, start_step: int = 0, summary_freq: int = 100) -> Summary:
-    return Summary(log, "run", 1000, summary_freq, start_step)  # type: ignore[arg-type]
+def summary_of(log: Log, session: Session, start_step: int = 0, summary_freq: int = 100) -> Summary:
+    env = session.env_runner.env
+    quiet: Any = log
+    return Summary(quiet, "run", env, 1000, summary_freq, start_step)
 
 
 def report(summary: Summary, session: Session, step: int) -> Display:
     display = Display()
     session.env_runner.step_count = step
-    summary.report(session, display)  # type: ignore[arg-type]
+    observations = session.env_runner.observations
+    summary.report(session.position, observations, display)  # type: ignore[arg-type]
     return display
 
 
@@ -63,7 +68,7 @@ def episodes(rewards: list[float], **episode_metrics: list[float]) -> EpisodeBat
 
 def test_episodes_weigh_alike_however_they_arrive(make_session: MakeSession) -> None:
     log, session = Log(), make_session()
-    summary = summary_of(log)
+    summary = summary_of(log, session)
     summary.add_episodes(episodes([1.0, 1.0, 1.0], success=[0, 0, 1], error_m=[1, 1, 1]))
     summary.add_episodes(episodes([], success=[], error_m=[]))
     summary.add_episodes(episodes([5.0], success=[1], error_m=[9]))
@@ -83,20 +88,27 @@ def test_episodes_weigh_alike_however_they_arrive(make_session: MakeSession) -> 
     }
 
 
-def test_measures_have_the_names_people_look_for() -> None:
-    assert measure_tag("success") == "Environment/Success Rate"
-    assert measure_tag("collision") == "Environment/Collision Rate"
-    assert measure_tag("position_error_m") == "Environment/Position Error M"
+def test_metrics_have_the_names_of_their_figures() -> None:
+    figures = (rate("crash", "crashes", key="crash_rate"), error("gap_m", "gap", "mm", 1000.0))
+    assert metric_tag("success", figures) == "Environment/Success Rate"
+    assert metric_tag("crash", figures) == "Environment/Crash Rate"
+    assert metric_tag("gap_m", figures) == "Environment/Gap M"
+    assert metric_tag("laps_driven", figures) == "Environment/Laps Driven"
+
+
+def test_grasping_keeps_its_tags() -> None:
+    tags = [metric_tag(name, GraspEvaluator.figures) for name in ("collision", "position_error_m")]
+    assert tags == ["Environment/Collision Rate", "Environment/Position Error M"]
 
 
 def test_summaries_come_at_multiples_of_their_frequency(make_session: MakeSession) -> None:
     log, session = Log(), make_session()
-    summary = summary_of(log)
+    summary = summary_of(log, session)
     for step in range(32, 480, 32):
         report(summary, session, step)
     # The first update at once, and then the first step at or after 100, 200, 300 and 400.
     assert list(log.points) == [32, 128, 224, 320, 416]
-    resumed = summary_of(log2 := Log(), start_step=320)
+    resumed = summary_of(log2 := Log(), session, start_step=320)
     for step in range(352, 480, 32):
         report(resumed, session, step)
     assert list(log2.points) == [352, 416]
@@ -104,7 +116,7 @@ def test_summaries_come_at_multiples_of_their_frequency(make_session: MakeSessio
 
 def test_a_summary_starts_anew_and_the_status_remembers(make_session: MakeSession) -> None:
     log, session = Log(), make_session()
-    summary = summary_of(log)
+    summary = summary_of(log, session)
     summary.add_episodes(episodes([1.0, 3.0], success=[0, 1]))
     report(summary, session, 100)
     display = report(summary, session, 200)  # no episode has ended in between
@@ -119,8 +131,8 @@ def test_a_summary_starts_anew_and_the_status_remembers(make_session: MakeSessio
 
 def test_the_status_says_where_the_run_stands(make_session: MakeSession) -> None:
     log, session = Log(), make_session()
-    summary = summary_of(log)
-    summary.status(session, "running")
+    summary = summary_of(log, session)
+    summary.status(session.position, "running")
     before = log.statuses[-1]
     assert before.pop("elapsed_s") >= 0
     assert before == {
@@ -137,7 +149,7 @@ def test_the_status_says_where_the_run_stands(make_session: MakeSession) -> None
     }
     summary.note_checkpoint(Path("/somewhere/step-9"))
     session.env_runner.step_count = 64
-    summary.status(session, "finished")
+    summary.status(session.position, "finished")
     assert log.statuses[-1]["state"] == "finished"
     assert log.statuses[-1]["step"] == 64
     assert log.statuses[-1]["last_checkpoint"] == "/somewhere/step-9"
@@ -156,7 +168,7 @@ def test_the_score_counts_lessons_before_success_and_rewards_where_there_is_neit
     make_session: MakeSession,
 ) -> None:
     log, session = Log(), make_session("target", curriculum=LESSONS)
-    summary = summary_of(log)
+    summary = summary_of(log, session)
     assert summary.score is None
     summary.add_episodes(episodes([1.0, 2.0], success=[1, 0]))
     report(summary, session, 100)
@@ -168,15 +180,16 @@ def test_the_score_counts_lessons_before_success_and_rewards_where_there_is_neit
     assert summary.score == 1.0  # a success rate of 0 in lesson 2 beats any in lesson 1
     assert log.points[200]["Environment/Lesson Number/lesson"] == 2
     assert log.statuses[-1]["lesson"] == log.statuses[-1]["lessons"] == 2
-    plain = summary_of(Log())
+    session = make_session()
+    plain = summary_of(Log(), session)
     plain.add_episodes(episodes([-3.0]))
-    report(plain, make_session(), 100)
+    report(plain, session, 100)
     assert plain.score == -3.0
 
 
 def test_no_lesson_is_logged_without_a_curriculum(make_session: MakeSession) -> None:
-    log = Log()
-    report(summary_of(log), make_session(), 100)
+    log, session = Log(), make_session()
+    report(summary_of(log, session), session, 100)
     assert not [tag for tag in log.points[100] if "Lesson" in tag]
 
 
@@ -184,7 +197,7 @@ def test_every_tenth_summary_shows_what_the_cameras_see(make_session: MakeSessio
     log = Log()
     camera = {"camera": {"type": "conv", "layers": [[2, 3, 1]]}}
     session = make_session("picture", encoders=camera)
-    summary = summary_of(log, summary_freq=10)
+    summary = summary_of(log, session, summary_freq=10)
     for step in range(10, 220, 10):
         report(summary, session, step)
     shown = ("Observations/camera", (240, 240, 3))
@@ -197,7 +210,7 @@ def test_time_left_is_that_of_the_steps_that_are_left(
     now = [50.0]
     monkeypatch.setattr("trainers.reporting.summary.time.monotonic", lambda: now[0])
     log, session = Log(), make_session()
-    summary = summary_of(log, start_step=200)
+    summary = summary_of(log, session, start_step=200)
     now[0] += 10.0
     line = report(summary, session, 400).lines[0]
     assert line.seconds_left == pytest.approx(30.0)  # 600 steps at 20 a second

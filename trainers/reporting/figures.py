@@ -1,0 +1,62 @@
+"""Figures of an evaluation: what a report says of episodes, and how people read it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from numpy.typing import NDArray
+
+from envs.evaluation import SUCCESS, Evaluator, Figure, rate
+from trainers.common.errors import UserError, suggestion
+
+Metrics = Mapping[str, NDArray[Any]]
+"""By name (k,), what was reported of k episodes, or of k actions."""
+
+
+def report_figures(evaluator: Evaluator) -> dict[str, Figure]:
+    """How people read a report's entries, by their keys; what is not here is a plain number."""
+    name, label = evaluator.check_name, evaluator.check_name.replace("_", " ")
+    figures = (
+        Figure("reward", "reward"),
+        *episode_figures(evaluator),
+        *first_action_figures(evaluator),
+        rate(f"{name}_rate", f"{label} rate"),
+        rate(f"{name}_failures", f"{label} failures", better="lower"),
+    )
+    return {figure.name: figure for figure in figures}
+
+
+def episode_figures(evaluator: Evaluator) -> tuple[Figure, ...]:
+    """Figures of whole episodes."""
+    figures = (SUCCESS, *evaluator.figures)
+    if not evaluator.judges_first_action:
+        return figures
+    return tuple(figure for figure in figures if figure.summary == "mean")
+
+
+def first_action_figures(evaluator: Evaluator) -> tuple[Figure, ...]:
+    """Figures of the first action, where it is judged."""
+    return tuple(
+        figure.of_first_action() if figure.summary == "mean" else figure
+        for figure in (SUCCESS, *evaluator.figures)
+    )
+
+
+def summaries(figures: Sequence[Figure], metrics: Metrics) -> dict[str, Any]:
+    """What a report says of episodes' metrics (k,)."""
+    for figure in figures:
+        if figure.metric not in (*metrics, SUCCESS.metric):
+            raise UserError(
+                f"the environment's figure {figure.name!r} is made of {figure.metric!r}, which is "
+                f"not among its episode metrics; {suggestion(figure.metric, metrics)}"
+            )
+    return {f.name: f.summarize(metrics[f.metric]) for f in figures if f.metric in metrics}
+
+
+def check_report(name: str, outcomes: Metrics) -> dict[str, Any]:
+    """The shares of a physical check's outcomes (k,)."""
+    if not outcomes:
+        return {}
+    rates = {outcome: float(rows.mean()) for outcome, rows in outcomes.items()}
+    return {f"{name}_rate": rates.pop(SUCCESS.metric), f"{name}_failures": rates}
