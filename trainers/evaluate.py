@@ -64,7 +64,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     offered = () if environment is None else environment.cls.evaluation_options
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
-        description="Report how good a policy is, on scenes never used for training.",
+        description="Report how good a policy is, in episodes never used for training.",
         parents=[generic],
         epilog=None if policy else "POLICY --help lists the options of its environment, too.",
     )
@@ -89,7 +89,7 @@ def _generic_options() -> argparse.ArgumentParser:
         prog=PROGRAM, usage=f"{PROGRAM} POLICY [KEY=VALUE ...] [options]", add_help=False
     )
     parser.add_argument("--episodes", type=_positive, help="how many (default: the environment's)")
-    parser.add_argument("--seed", type=_not_negative, default=0, help="of the scenes")
+    parser.add_argument("--seed", type=_not_negative, default=0, help="of the episodes")
     parser.add_argument(
         "--render",
         nargs="?",

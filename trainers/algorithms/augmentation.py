@@ -21,7 +21,7 @@ def unchanged(observations: Observations) -> Observations:
 class RandomShift:
     """Shifts every frame by up to some pixels (Kostrikov et al. 2020, arXiv:2004.13649).
 
-    Cameras of one observation are shifted apart; what comes into view repeats the edge.
+    Images of one observation are shifted apart; what comes into view repeats the edge.
 
     Args:
         pixels: the furthest a frame is shifted, along each axis.
@@ -39,8 +39,8 @@ class RandomShift:
     def _shifted(self, images: Tensor) -> Tensor:
         count, height, width, _ = images.shape
         rows, columns = self._sources(count, height), self._sources(count, width)
-        picked = torch.arange(count, device=images.device)[:, None, None]
-        return gather(images, (picked, rows[:, :, None], columns[:, None, :]))
+        chosen = torch.arange(count, device=images.device)[:, None, None]
+        return gather(images, (chosen, rows[:, :, None], columns[:, None, :]))
 
     def _sources(self, count: int, length: int) -> Tensor:
         """From where along an axis each pixel of each image comes, (count, length)."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Let every OSError of the block name `path`.
+    """Let every OSError that is raised meanwhile name `path`.
 
     The operating system's own errors (a full disk, say) often name no file at all, or a temporary
     one that means nothing to the user.

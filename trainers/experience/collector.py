@@ -166,7 +166,7 @@ class Collector(Generic[Output]):
     ) -> Tensor:
         """Keeps and encodes the frames that came into view; returns everyone's index (N,).
 
-        Without cameras every observation counts as a frame of its own.
+        Without images every observation counts as a frame of its own.
         """
         new = self._new if self.frame_names else self._everyone
         if len(new):

@@ -1,4 +1,4 @@
-"""Experience that is drawn again and again: a ring of transitions, each camera frame kept once.
+"""Experience that is drawn again and again: a ring of transitions, each frame kept once.
 
 Time runs through the rows of the ring, and a row holds one observation of each of N environments
 and what came of the action taken there. The observation a transition leads to is thus the next

@@ -84,7 +84,7 @@ class Network(nn.Module):
         self.state_size = 0 if self.memory is None else self.memory.state_size
 
     def encode_frames(self, frames: Mapping[str, Tensor]) -> Tensor | None:
-        """What frames alone decide, (U, f); None for a network without cameras.
+        """What frames alone decide, (U, f); None for a network without images.
 
         Where there are no vectors that is the whole network, so that experience which shares a
         frame shares all of its cost.

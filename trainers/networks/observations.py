@@ -1,4 +1,4 @@
-"""Observations on the learner's side: tensors, with each distinct camera frame once.
+"""Observations on the learner's side: tensors, with each distinct frame once.
 
 Images are *frames*: many steps may share one, so they are kept apart and referred to by index.
 Vectors change every step and are kept as they are.

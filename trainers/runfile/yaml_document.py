@@ -2,7 +2,7 @@
 
 Scalars follow YAML 1.2's core schema instead of PyYAML's 1.1: `1e-3` is a number, `010` is ten,
 `1:30` is text, and only `true` and `false` are booleans. `yes`, `no`, `on` and `off` are text: they
-are often meant so (a block named `no`), and where a boolean is needed they are refused, not
+are often meant so (a part named `no`), and where a boolean is needed they are refused, not
 misread.
 """
 
