@@ -1,4 +1,4 @@
-"""The album of an evaluation: what the policy saw and did, how far it was off, and a film."""
+"""The pictures of an evaluation: what the policy saw and did, how far it was off, and a film."""
 
 from __future__ import annotations
 

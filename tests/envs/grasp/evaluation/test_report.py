@@ -1,4 +1,4 @@
-"""The album of an evaluation: what is judged, and what is drawn."""
+"""The pictures of an evaluation: what is judged, and what is drawn."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from envs.grasp.env import make_vector_env
-from envs.grasp.evaluation import report as album_module
+from envs.grasp.evaluation import report as report_module
 from envs.grasp.evaluation.film import film
 from envs.grasp.evaluation.plots import AIM_COLOR, contact_sheet
 from envs.grasp.scene.sampler import heading
@@ -25,8 +25,8 @@ SHOWN, ENVS = 7, 8
 
 @pytest.fixture(autouse=True)
 def few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(album_module, "SHOWN", SHOWN)
-    monkeypatch.setattr(album_module, "FILMED", 1)
+    monkeypatch.setattr(report_module, "SHOWN", SHOWN)
+    monkeypatch.setattr(report_module, "FILMED", 1)
 
 
 @pytest.fixture(scope="module")
@@ -50,26 +50,26 @@ def outcomes(*, success: int) -> dict[str, np.ndarray]:
 
 
 def test_errors_are_those_to_the_middle_of_the_goal_region(env: GraspVectorEnv) -> None:
-    album = env.evaluator().pictures()
-    album.add(actions(env, ahead=-0.025, up=0.004, yaw_deg=-3.0), outcomes(success=1))
-    (judged,) = album._judged
+    report = env.evaluator().pictures()
+    report.add(actions(env, ahead=-0.025, up=0.004, yaw_deg=-3.0), outcomes(success=1))
+    (judged,) = report._judged
     # The region's gap goes from 10 to 20 mm.
     np.testing.assert_allclose(judged.error_m, np.tile([0.0, 0.004, 0.01], (ENVS, 1)), atol=1e-9)
     np.testing.assert_allclose(judged.yaw_error_deg, -3.0)
     np.testing.assert_allclose(judged.distance_m, np.hypot(0.004, 0.01))
-    assert len(album._shots) == SHOWN
-    assert album._shots[0].caption == "10.8 mm, 3.0 deg   picked"
-    assert album._shots[1].caption == "10.8 mm, 3.0 deg   no seal"
+    assert len(report._shots) == SHOWN
+    assert report._shots[0].caption == "10.8 mm, 3.0 deg   picked"
+    assert report._shots[1].caption == "10.8 mm, 3.0 deg   no seal"
 
 
 @pytest.mark.parametrize("checked", [True, False])
 def test_all_files_are_drawn_and_can_be_opened(env: GraspVectorEnv, checked: bool) -> None:
-    album = env.evaluator().pictures()
+    report = env.evaluator().pictures()
     found = outcomes(success=ENVS) if checked else {}
     for _ in range(2):
-        album.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), found)
-    files = dict(album.files())
-    assert tuple(files) == album.file_names
+        report.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), found)
+    files = dict(report.files())
+    assert tuple(files) == report.file_names
     for name, content in files.items():
         with Image.open(io.BytesIO(content)) as image:
             image.load()
@@ -79,9 +79,9 @@ def test_all_files_are_drawn_and_can_be_opened(env: GraspVectorEnv, checked: boo
 def test_the_film_goes_on_to_the_pick_only_where_there_is_one(env: GraspVectorEnv) -> None:
     lengths_ms = []
     for found in ({}, outcomes(success=ENVS)):
-        album = env.evaluator().pictures()
-        album.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), found)
-        content = film(album._shots[:1], Support(), Pick(), bool(found))
+        report = env.evaluator().pictures()
+        report.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), found)
+        content = film(report._shots[:1], Support(), Pick(), bool(found))
         with Image.open(io.BytesIO(content)) as image:
             assert image.info["loop"] == 0
             lengths_ms.append(0)
@@ -100,9 +100,9 @@ def test_the_cup_is_drawn_where_the_camera_would_see_it(
         "matplotlib.axes.Axes.plot",
         lambda self, u, v, color, **_: lines.append((u, v)) if color == AIM_COLOR else None,
     )
-    album = env.evaluator().pictures()
-    album.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), {})
-    shot = album._shots[0]
+    report = env.evaluator().pictures()
+    report.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), {})
+    shot = report._shots[0]
     contact_sheet([shot], np.zeros(3))
     (rim_u, rim_v), (stem_u, stem_v) = lines
     u, v, depth = project(shot.view, shot.tooltip_m[None, None])[0, 0]
@@ -117,9 +117,9 @@ def test_an_rgb_camera_alone_will_do() -> None:
     env = make_vector_env(1, simulator="fast", cameras={"top": Camera(type="rgb")})
     try:
         env.reset()
-        album = env.evaluator().pictures()
-        album.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), {})
-        assert next(iter(album.files()))[1].startswith(b"\x89PNG")
+        report = env.evaluator().pictures()
+        report.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), {})
+        assert next(iter(report.files()))[1].startswith(b"\x89PNG")
     finally:
         env.close()
 
