@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -147,6 +147,22 @@ def final_parameters(run: RunSettings) -> dict[str, ParameterValue]:
     curriculum = build_curriculum(run)
     lesson = {} if curriculum is None else curriculum.final_parameters()
     return {**run.environment_parameters, **lesson}
+
+
+def evaluation_environment(run: RunSettings, episodes: int) -> Environment:
+    """Environments for evaluation alone: the run's, on its last lesson's task.
+
+    Args:
+        run: the settings.
+        episodes: how many it will be evaluated by; there are no more environments than those.
+    """
+    settings = run.environment.settings
+    if getattr(settings, "num_envs", 1) > episodes:
+        few = replace(run.environment, settings=settings.model_copy(update={"num_envs": episodes}))
+        run = replace(run, environment=few)
+    env = build_environment(run, FIRST_SEED)
+    env.set_parameters(final_parameters(run))
+    return env
 
 
 def evaluate_policy(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from trainers.algorithms.base import TrainerSettings
@@ -13,12 +13,13 @@ from trainers.common.errors import UserError
 from trainers.common.files import write_atomically
 from trainers.common.timers import Timer, recording
 from trainers.experience.env_runner import NonFiniteError
+from trainers.held_out import HeldOutEvaluation
 from trainers.inference.metadata import FILE as METADATA
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.summary import Summary
 from trainers.reporting.terminal import TerminalDisplay, make_display
 from trainers.runfile.registry import load_registries
-from trainers.runfile.settings import dump_yaml, load_run
+from trainers.runfile.settings import RunSettings, dump_yaml, load_run
 from trainers.saving.checkpoint import Checkpoints, Loaded
 from trainers.saving.run_folder import (
     CHECKPOINTS,
@@ -28,7 +29,7 @@ from trainers.saving.run_folder import (
     find_checkpoint,
 )
 from trainers.session import Session
-from trainers.training import train
+from trainers.training import Ending, Training
 
 TIMERS = "timers.json"
 
@@ -56,12 +57,14 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
     directory = options.results_dir / run_id
     checkpoints = Checkpoints(directory / CHECKPOINTS, settings.keep_checkpoints)
     check(directory, resume=options.resume, force=options.force)
-    with closing(Session(run, registries, stop_requested)) as session:
+    with ExitStack() as stack:
+        session = stack.enter_context(closing(Session(run, registries, stop_requested)))
         # Nothing is replaced before it is certain that the run can begin.
         resumed = _start(session, options, checkpoints)
+        start = session.env_runner.step_count
+        held_out = stack.enter_context(_held_out(session, run, start))
         files = {CONFIGURATION: dump_yaml(run), METADATA: session.metadata.to_json()}
         begin(directory, files, resume=options.resume)
-        start = session.env_runner.step_count
         with (
             closing(RunLog(directory, start if resumed else None)) as log,
             make_display(run_id, settings.max_steps, session.lesson_count, start) as display,
@@ -72,7 +75,12 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
                 display.message(note)
             env = session.env_runner.env
             summary = Summary(log, run_id, env, settings.max_steps, settings.summary_freq, start)
-            return _train(session, settings, summary, checkpoints, display)
+            if held_out is not None:
+                if resumed is None:
+                    held_out.log(log)
+                summary.note_evaluation(held_out.latest)
+            training = Training(session, settings, log, summary, checkpoints, display, held_out)
+            return _train(training, session, summary, checkpoints, display).finished
 
 
 @contextmanager
@@ -86,28 +94,42 @@ def _timers_written(directory: Path) -> Iterator[None]:
         write_atomically(directory / TIMERS, json.dumps(root.tree(), indent=2) + "\n")
 
 
+@contextmanager
+def _held_out(session: Session, run: RunSettings, start: int) -> Iterator[HeldOutEvaluation | None]:
+    """What evaluates while the run learns, if the run file asks for it."""
+    if run.evaluation is None:
+        yield None
+        return
+    with closing(HeldOutEvaluation(session, run, run.evaluation, start)) as held_out:
+        yield held_out
+
+
 def _train(
+    training: Training,
     session: Session,
-    settings: TrainerSettings,
     summary: Summary,
     checkpoints: Checkpoints,
     display: TerminalDisplay,
-) -> bool:
+) -> Ending:
     """Trains, and leaves the run's state in status.json however it ends."""
-    state = "failed"
+    state, reason = "failed", None
     try:
-        finished = train(session, settings, summary, checkpoints, display)
-        state = "finished" if finished else "interrupted"
-        if not finished:
+        ending = training.run()
+        state, reason = "finished" if ending.finished else "interrupted", ending.reason
+        if not ending.finished:
             display.message("stopped and saved; go on with --resume")
-        return finished
+        return ending
     except NonFiniteError as error:
-        raise NonFiniteError(f"{error}; {_last_good(checkpoints)}") from error
+        reason = f"{error}; {_last_good(checkpoints)}"
+        raise NonFiniteError(reason) from error
+    except BaseException as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise
     finally:
         saved = checkpoints.list_checkpoints()
         if saved:
             summary.note_checkpoint(saved[-1].path)
-        summary.status(session.position, state)
+        summary.status(session.position, state, reason)
 
 
 def _last_good(checkpoints: Checkpoints) -> str:

@@ -24,7 +24,7 @@ from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import RunSettings, load_run
 from trainers.saving.checkpoint import Checkpoints
 from trainers.session import Session
-from trainers.training import train
+from trainers.training import Training
 
 RUN_FILE = Path(__file__).with_name("training.yaml")
 BUFFER_STEPS = 32
@@ -83,7 +83,7 @@ class Ventosa:
         with ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             self.session = stack.enter_context(closing(Session(run, load_registries())))
-            log = stack.enter_context(closing(RunLog(folder)))
+            self._log = log = stack.enter_context(closing(RunLog(folder)))
             self.session.reset()
             env = self.session.env_runner.env
             self._summary = Summary(log, "speed", env, 1, self._settings.summary_freq)
@@ -96,7 +96,8 @@ class Ventosa:
         """See `Contender`."""
         steps = self.session.env_runner.step_count + self._settings.hyperparameters.buffer_size
         settings = self._settings.model_copy(update={"max_steps": steps})
-        train(self.session, settings, self._summary, self._checkpoints, self._display)
+        summary, checkpoints = self._summary, self._checkpoints
+        Training(self.session, settings, self._log, summary, checkpoints, self._display).run()
 
 
 class _NoCheckpoints(Checkpoints):

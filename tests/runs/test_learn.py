@@ -438,7 +438,9 @@ def test_a_reward_that_breaks_ends_the_run_with_its_name_and_the_way_back(
     way_back = last.format(done.results / "toy/checkpoints")
     broken = f"error: step {step}: the reward 'breaking' of environment 0 is nan; {way_back}\n"
     assert done.errors.endswith(broken)
-    assert status(done.results)["state"] == "failed"
+    said = status(done.results)
+    assert said["state"] == "failed"
+    assert f"error: {said['reason']}\n" == broken
 
 
 def test_observations_that_are_not_numbers_end_the_run(

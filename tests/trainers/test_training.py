@@ -12,13 +12,13 @@ import pytest
 import torch
 
 from envs.environment import EnvironmentFailure
+from trainers import training as training_module
 from trainers.experience.env_runner import NonFiniteError
 from trainers.reporting.summary import Summary
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings
 from trainers.saving.checkpoint import Checkpoints, Loaded
 from trainers.session import Session
-from trainers.training import train
 
 MakeRun = Callable[..., RunSettings]
 LESSONS = {
@@ -78,7 +78,11 @@ class Training:
         quiet: Any = self.quiet
         env, settings = self.session.env_runner.env, self.settings
         summary = Summary(quiet, "run", env, settings.max_steps, settings.summary_freq)
-        return train(self.session, self.settings, summary, self.checkpoints, quiet)
+        loop = training_module.Training(
+            self.session, settings, quiet, summary, self.checkpoints, quiet
+        )
+        self.ending = loop.run()
+        return self.ending.finished
 
 
 @pytest.fixture
@@ -106,6 +110,7 @@ def test_a_run_ends_after_its_steps_and_is_saved_on_the_way(
     assert one.train() is True
     assert one.steps == 80  # the fifth collection reaches 72
     assert one.saved == [32, 64, 80]
+    assert one.ending.reason == "max_steps: 72 steps were taken"
     last = one.checkpoints.load_latest()
     assert last.state["step"] == 80
     for name, tensor in one.session.weights().items():

@@ -32,10 +32,12 @@ class Algorithm(Protocol):
     Attributes:
         Settings: its model, of `TrainerSettings`.
         policy: what acts, and what is saved as the weights.
+        collection_steps: steps that `collect` takes, over all environments.
     """
 
     Settings: ClassVar[type[TrainerSettings]]
     policy: PolicyNetwork
+    collection_steps: int
 
     @staticmethod
     def build_policy(factory: NetworkFactory, settings: Any) -> PolicyNetwork:

@@ -135,6 +135,7 @@ class OffPolicyAlgorithm:
         hyper, env, size = settings.hyperparameters, env_runner.env, policy.scale.size
         self._seen = {*policy.sees, *policy.critic_sees}
         self._shape = (env.num_envs, size)
+        self.collection_steps = settings.time_horizon * env.num_envs
         self._max_gradient_norm = hyper.max_gradient_norm or float("inf")
         self._buffer = ReplayBuffer(
             env.single_observation_space, size, env.num_envs, hyper.buffer_size, device

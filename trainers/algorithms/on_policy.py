@@ -70,10 +70,12 @@ class OnPolicyAlgorithm:
         )
         self._gamma, self._lambd = hyperparameters.gamma, hyperparameters.lambd
         count = env_runner.env.num_envs
+        steps = -(-hyperparameters.buffer_size // count)
+        self.collection_steps = steps * count
         self._collector = RolloutCollector(
             policy,
             env_runner,
-            -(-hyperparameters.buffer_size // count),
+            steps,
             generator,
             device,
             RewardNormalizer(count, self._gamma) if hyperparameters.normalize_rewards else None,

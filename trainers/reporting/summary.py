@@ -51,8 +51,7 @@ class Summary:
         start_step: steps the run had when this process took it up.
 
     Attributes:
-        score: how good the policy was at the last summary: the lesson plus the success rate, or,
-            where success is not reported, the mean cumulative reward. None before the first.
+        reward: mean cumulative reward at the last summary; None before there was an episode.
     """
 
     def __init__(
@@ -75,7 +74,12 @@ class Summary:
         self._start_s = self._summary_s = time.monotonic()
         self._summary_step = start_step
         self._checkpoint: str | None = None
-        self.score: float | None = None
+        self._evaluation: dict[str, Any] | None = None
+
+    @property
+    def reward(self) -> float | None:
+        """See the class."""
+        return self._last.get("Environment/Cumulative Reward")
 
     def add(self, statistics: Mapping[str, float]) -> None:
         """Adds the statistics of an update."""
@@ -118,18 +122,24 @@ class Summary:
             self._summarize(position, observations)
             display.update(self._line(position))
 
-    def status(self, position: RunPosition, state: str) -> None:
+    def note_evaluation(self, report: Mapping[str, Any]) -> None:
+        """Remembers the latest evaluation, for status.json."""
+        self._evaluation = dict(report)
+
+    def status(self, position: RunPosition, state: str, reason: str | None = None) -> None:
         """Rewrites status.json.
 
         Args:
             position: how far the run has come.
             state: `running`, `finished`, `interrupted` or `failed`.
+            reason: why it is no longer running.
         """
         line = self._line(position)
         self._log.status(
             {
                 "run_id": self._run_id,
                 "state": state,
+                "reason": reason,
                 "step": line.step,
                 "max_steps": self._max_steps,
                 "lesson": line.lesson + 1,
@@ -139,6 +149,7 @@ class Summary:
                 "steps_per_second": line.steps_per_second,
                 "elapsed_s": time.monotonic() - self._start_s,
                 "last_checkpoint": self._checkpoint,
+                "evaluation": self._evaluation,
             }
         )
 
@@ -157,8 +168,6 @@ class Summary:
             self._show_observations(observations, step)
         self._summaries += 1
         self._last |= means
-        success, reward = self._last_success(), self._last.get("Environment/Cumulative Reward")
-        self.score = reward if success is None else (position.lesson or 0) + success
         self.status(position, "running")
 
     def _show_observations(self, observations: Mapping[str, NDArray[Any]], step: int) -> None:
@@ -173,7 +182,7 @@ class Summary:
         left_s = (self._max_steps - step) / overall if overall > 0 else None
         return RunStatus(
             step=step,
-            reward=self._last.get("Environment/Cumulative Reward"),
+            reward=self.reward,
             lesson=position.lesson or 0,
             success=self._last_success(),
             steps_per_second=self._last.get("Performance/Steps Per Second"),

@@ -73,6 +73,7 @@ class RunSettings:
     environment_parameters: dict[str, ParameterValue]
     """Values that hold for the whole run, unless the curriculum sets them."""
     trainer: Component
+    evaluation: EvaluationSettings | None
     seed: int
     device: str
 
@@ -84,6 +85,30 @@ class PolicyComponents:
     encoders: dict[str, Component]
     """By the name of the observation."""
     trainer: Component
+
+
+class Target(BaseModel, frozen=True, extra="forbid"):
+    """What a run may stop at."""
+
+    metric: str = Field(
+        min_length=1, description="A figure of the evaluation, such as success or reward."
+    )
+    at_least: float = Field(description="The run ends once the figure is this or more.")
+
+
+class EvaluationSettings(BaseModel, frozen=True, extra="forbid"):
+    """Evaluation while the run learns, on the last lesson's task, in environments of its own."""
+
+    interval: int = Field(ge=1, description="Steps of training between two evaluations.")
+    episodes: int = Field(100, ge=1, description="Episodes of each evaluation.")
+    seed: int = Field(
+        1,
+        ge=0,
+        lt=2**31,
+        description="Seed of the episodes, which no run trains on; `trainers.evaluate` has 0, so "
+        "that a checkpoint is not judged by the very episodes that it was chosen by.",
+    )
+    stop_when: Target | None = Field(None, description="Ends the run before max_steps.")
 
 
 class _RunFile(BaseModel, frozen=True, extra="forbid"):
@@ -103,6 +128,9 @@ class _RunFile(BaseModel, frozen=True, extra="forbid"):
         None, description="Values or samplers of parameters that the environment lists."
     )
     trainer: dict[str, Any] = Field(description="The algorithm: its trainer_type and settings.")
+    evaluation: EvaluationSettings | None = Field(
+        None, description="Evaluation while the run learns; the best checkpoint is chosen by it."
+    )
     seed: int = Field(0, ge=0, lt=2**32, description="Seed of everything that is random.")
     device: str = Field("cpu", min_length=1, description="Device of the networks, as torch has it.")
 
@@ -151,6 +179,7 @@ def resolved(run: RunSettings) -> dict[str, Any]:
     data["curriculum"] = run.curriculum and _plain(run.curriculum)
     data["environment_parameters"] = PARAMETERS.dump_python(run.environment_parameters, mode="json")
     data["trainer"] = _plain(run.trainer, TRAINER_TYPE_KEY)
+    data["evaluation"] = run.evaluation and run.evaluation.model_dump(mode="json")
     return {**data, "seed": run.seed, "device": run.device}
 
 
@@ -196,6 +225,7 @@ class _Sections:
             curriculum=curriculum,
             environment_parameters=top.environment_parameters or {},
             trainer=trainer,
+            evaluation=top.evaluation,
             seed=top.seed,
             device=top.device,
         )

@@ -146,6 +146,8 @@ def test_the_status_says_where_the_run_stands(make_session: MakeSession) -> None
         "success": None,
         "steps_per_second": None,
         "last_checkpoint": None,
+        "reason": None,
+        "evaluation": None,
     }
     summary.note_checkpoint(Path("/somewhere/step-9"))
     session.env_runner.step_count = 64
@@ -164,27 +166,20 @@ LESSONS = {
 }
 
 
-def test_the_score_counts_lessons_before_success_and_rewards_where_there_is_neither(
-    make_session: MakeSession,
-) -> None:
+def test_the_reward_is_that_of_the_last_summary(make_session: MakeSession) -> None:
     log, session = Log(), make_session("target", curriculum=LESSONS)
     summary = summary_of(log, session)
-    assert summary.score is None
+    assert summary.reward is None
     summary.add_episodes(episodes([1.0, 2.0], success=[1, 0]))
     report(summary, session, 100)
-    assert summary.score == 0.5
+    assert summary.reward == 1.5
     assert log.points[100]["Environment/Lesson Number/lesson"] == 1
     session.advance_curriculum(episodes([1.0]), 0.5)
-    summary.add_episodes(episodes([1.0, 1.0], success=[0, 0]))
+    summary.add_episodes(episodes([-3.0]))
     report(summary, session, 200)
-    assert summary.score == 1.0  # a success rate of 0 in lesson 2 beats any in lesson 1
+    assert summary.reward == -3.0
     assert log.points[200]["Environment/Lesson Number/lesson"] == 2
     assert log.statuses[-1]["lesson"] == log.statuses[-1]["lessons"] == 2
-    session = make_session()
-    plain = summary_of(Log(), session)
-    plain.add_episodes(episodes([-3.0]))
-    report(plain, session, 100)
-    assert plain.score == -3.0
 
 
 def test_no_lesson_is_logged_without_a_curriculum(make_session: MakeSession) -> None:
