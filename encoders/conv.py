@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 
 import torch
 from gymnasium.spaces import Box
-from pydantic import BaseModel, Field, PositiveInt
+from pydantic import Field, PositiveInt
 from torch import nn
 
-from encoders.inputs import image_input
+from encoders.inputs import ImageSettings, image_input
 from encoders.layers import Activation, ConvLayer, convolutions, feature_map_area
 
 _FIRST_80: tuple[ConvLayer, ...] = ((16, 8, 4), (32, 4, 2))
@@ -32,6 +32,7 @@ class ConvolutionalEncoder(nn.Module):
         space: Images of shape (height, width, channels).
         layers: (filters, kernel, stride) of each convolution, from the image inwards.
         activation: What follows each convolution.
+        validity_channel: See `ImageSettings`.
 
     Attributes:
         features_dim: Length of the flattened feature map.
@@ -40,9 +41,15 @@ class ConvolutionalEncoder(nn.Module):
         ValueError: The space holds no images, or images too small for the layers.
     """
 
-    def __init__(self, space: Box, layers: Sequence[ConvLayer], activation: Activation) -> None:
+    def __init__(
+        self,
+        space: Box,
+        layers: Sequence[ConvLayer],
+        activation: Activation,
+        validity_channel: bool = False,
+    ) -> None:
         super().__init__()
-        self.input = image_input(space)
+        self.input = image_input(space, validity_channel)
         area = feature_map_area(
             space,
             [(kernel, stride) for _, kernel, stride in layers],
@@ -59,7 +66,7 @@ class ConvolutionalEncoder(nn.Module):
 class Conv(ConvolutionalEncoder):
     """Encoder ``conv``: convolutions as the run file lists them."""
 
-    class Settings(BaseModel, frozen=True, extra="forbid"):
+    class Settings(ImageSettings, frozen=True, extra="forbid"):
         """Settings of the encoder ``conv``."""
 
         layers: Annotated[
@@ -74,13 +81,13 @@ class Conv(ConvolutionalEncoder):
         )
 
     def __init__(self, space: Box, settings: Settings) -> None:
-        super().__init__(space, settings.layers, settings.activation)
+        super().__init__(space, settings.layers, settings.activation, settings.validity_channel)
 
 
 class Paper(ConvolutionalEncoder):
     """Encoder ``paper``: one of the four networks of "Learning to Grasp from 2.5D images"."""
 
-    class Settings(BaseModel, frozen=True, extra="forbid"):
+    class Settings(ImageSettings, frozen=True, extra="forbid"):
         """Settings of the encoder ``paper``."""
 
         size: Literal[32, 80, 128, 256] = Field(
@@ -90,4 +97,4 @@ class Paper(ConvolutionalEncoder):
         )
 
     def __init__(self, space: Box, settings: Settings) -> None:
-        super().__init__(space, PAPER_LAYERS[settings.size], "relu")
+        super().__init__(space, PAPER_LAYERS[settings.size], "relu", settings.validity_channel)

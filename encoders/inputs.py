@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from gymnasium.spaces import Box
+from pydantic import BaseModel, Field
 from torch import nn
+from torch.nn import functional as F
 
 from encoders.spaces import UINT8_MAX, DepthImage
+
+
+class ImageSettings(BaseModel, frozen=True, extra="forbid"):
+    """Settings of every encoder of whole images."""
+
+    validity_channel: bool = Field(
+        False,
+        description="Depth only: a second channel, 1 where something was seen and 0 elsewhere.",
+    )
 
 
 class ImageInput(nn.Module):
@@ -29,21 +42,30 @@ class ImageInput(nn.Module):
         return self.scale(raw).permute(0, 3, 1, 2)
 
     def scale(self, raw: torch.Tensor) -> torch.Tensor:
-        """Turns the raw numbers into float32, element by element; here as they are."""
+        """Turns the raw numbers into float32, pixel by pixel; here as they are."""
         return raw.to(torch.float32)
 
 
 class DepthInput(ImageInput):
-    """Depth: to metres, clamped to the camera's range, which is then scaled to [0, 1]."""
+    """Depth: to metres, which are then scaled to [0, 1] over the range, "nothing seen" to 1.
 
-    def __init__(self, space: DepthImage) -> None:
+    Args:
+        space: The depth images.
+        validity_channel: Append a channel that is 1 where something was seen, otherwise 0.
+    """
+
+    def __init__(self, space: DepthImage, validity_channel: bool = False) -> None:
         super().__init__(space)
-        self.space = space
+        self.space, self.validity_channel = space, validity_channel
+        self.channels += validity_channel
 
     def scale(self, raw: torch.Tensor) -> torch.Tensor:
-        """Raw depths to [0, 1] over the camera's range."""
+        """Raw depths to [0, 1] over the camera's range, and where they are depths."""
         min_m, max_m = self.space.range_m
-        return self.space.decode(raw).sub_(min_m).mul_(1.0 / (max_m - min_m))
+        scaled = self.space.decode(raw).sub_(min_m).mul_(1.0 / (max_m - min_m))
+        if self.validity_channel:
+            return torch.cat([scaled, self.space.seen(raw).float()], dim=-1)
+        return scaled
 
 
 class ByteInput(ImageInput):
@@ -52,6 +74,35 @@ class ByteInput(ImageInput):
     def scale(self, raw: torch.Tensor) -> torch.Tensor:
         """Bytes to [0, 1]."""
         return raw.to(torch.float32).mul_(1.0 / UINT8_MAX)
+
+
+def fill_gaps(depth_m: torch.Tensor) -> torch.Tensor:
+    """Fills in pixels where nothing was seen, if they lie between two where something was.
+
+    A pixel is the middle of four lines of three pixels: along the row, the column and the two
+    diagonals. The farther end of each counts, and the line with the nearest one is believed: by a
+    straight edge there is one that runs along it. So edges stay where they are to half a pixel, no
+    depth is made up between the two sides, and no straight border of a region without depths moves.
+
+    Args:
+        depth_m: (B, H, W), infinite where nothing was seen.
+
+    Returns:
+        (B, H, W), the same where something was seen.
+    """
+    height, width = depth_m.shape[1:]
+    padded = F.pad(depth_m, (1, 1, 1, 1), value=math.inf)
+
+    def farther(down: int, right: int) -> torch.Tensor:
+        return torch.maximum(
+            padded[:, 1 + down :, 1 + right :][:, :height, :width],
+            padded[:, 1 - down :, 1 - right :][:, :height, :width],
+        )
+
+    filled = farther(0, 1)
+    for down, right in ((1, 0), (1, 1), (1, -1)):
+        filled.clamp_(max=farther(down, right))
+    return torch.where(depth_m == math.inf, filled, depth_m)
 
 
 class VectorInput(nn.Module):
@@ -70,16 +121,18 @@ class VectorInput(nn.Module):
         return raw.to(torch.float32)
 
 
-def image_input(space: Box) -> ImageInput:
+def image_input(space: Box, validity_channel: bool = False) -> ImageInput:
     """Builds the module that turns the raw images of a space into what a convolution takes.
 
     Depth images become [0, 1] over the camera's range, other bytes [0, 1]; floats stay as they are.
 
     Args:
         space: Images of shape (height, width, channels).
+        validity_channel: Of depth images: append a channel that tells which pixels are depths.
 
     Raises:
-        ValueError: The space holds no images, or numbers of unknown meaning.
+        ValueError: The space holds no images, numbers of unknown meaning, or no depth images whose
+            pixels could be missing where the channel is asked for.
     """
     if len(space.shape) == 1:
         raise ValueError(
@@ -89,7 +142,12 @@ def image_input(space: Box) -> ImageInput:
     if len(space.shape) != 3:
         raise ValueError(_neither(space))
     if isinstance(space, DepthImage):
-        return DepthInput(space)
+        return DepthInput(space, validity_channel)
+    if validity_channel:
+        raise ValueError(
+            "validity_channel: only depth images say where nothing was seen, and these are "
+            f"{space}: leave it out"
+        )
     if space.dtype == np.uint8:
         return ByteInput(space)
     if np.issubdtype(space.dtype, np.floating):

@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field, PositiveInt
 from torch import nn
 from torch.nn import functional as F
 
+from encoders.inputs import fill_gaps
 from encoders.layers import dense
 from encoders.spaces import DepthImage
 
@@ -31,8 +32,10 @@ class Keypoints(nn.Module):
 
     The image is looked at in overlapping patches. Each is described by its shape, which is its
     depths relative to that of its middle, clipped so that an edge is an edge however far the
-    background, and by where its middle is: the 3-D point that the camera's intrinsics give. What
-    lies farther than the camera's range is no point and gets no attention. Each of K attention maps
+    background, and by where its middle is: the 3-D point that the camera's intrinsics give. Single
+    pixels where nothing was seen are filled in from their neighbours; what is left of them, as
+    beyond the camera's range, counts as far away in a patch's shape, and as a middle it is no point
+    and gets no attention. Each of K attention maps
     (a softmax over all patches, as in spatial soft-argmax: Levine et al. 2016, arXiv:1504.00702)
     yields the mean of the points it attends to, their covariance (which tells the orientation of
     the surface), and the mean of some learned features.
@@ -96,7 +99,7 @@ class Keypoints(nn.Module):
     def forward(self, raw: torch.Tensor) -> torch.Tensor:
         """Raw depth images (B, H, W, 1) -> features (B, features_dim) float32."""
         with torch.no_grad():
-            depth_m = self.space.decode(raw)[..., 0]
+            depth_m = fill_gaps(self.space.decode_seen(raw)[..., 0])
             shapes, points, seen = self._look(depth_m)
         with self._precision(raw.device):
             described = self.place(torch.cat([self.shape(shapes), points], dim=-1))
@@ -110,13 +113,19 @@ class Keypoints(nn.Module):
         return torch.autocast(device.type, torch.bfloat16) if self._lowered else nullcontext()
 
     def _look(self, depth_m: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Depths (B, H, W) -> patches' shapes (B, n, p * p), middles (B, n, 3), seen (B, n)."""
-        patches = self._patches(depth_m)
-        middle_m = self._middles(patches)
-        shapes = (patches - middle_m[..., None, None]).mul_(1.0 / self._clip_m).clamp_(-1.0, 1.0)
+        """Depths (B, H, W) -> patches' shapes (B, n, p * p), middles (B, n, 3), seen (B, n).
+
+        Depths are infinite where nothing was seen, which in a patch counts as far as can be.
+        """
+        # In units of the clip: once for each pixel, not for all the patches that it is in.
+        patches = self._patches(depth_m * (1.0 / self._clip_m))
+        middles = self._middles(patches)
+        seen = middles.isfinite()
+        middles = middles.clamp(max=self.space.range_m[1] / self._clip_m)
+        shapes = (patches - middles[..., None, None]).clamp_(-1.0, 1.0)
+        middle_m = middles * self._clip_m
         points = middle_m[..., None] * self.rays
         points[..., 2] -= self._middle_m
-        seen = middle_m < self.space.range_m[1]
         return (
             shapes.flatten(3).flatten(1, 2),
             points.mul_(UNITS_PER_M).flatten(1, 2),

@@ -5,19 +5,20 @@ Layers follow mlagents/trainers/torch_entities/encoders.py; every dense layer en
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 from gymnasium.spaces import Box
-from pydantic import BaseModel, Field, PositiveInt
+from pydantic import Field, PositiveInt
 from torch import nn
 
 from encoders.conv import ConvolutionalEncoder
-from encoders.inputs import image_input, vector_input
+from encoders.inputs import ImageSettings, image_input, vector_input
 from encoders.layers import ConvLayer, dense, feature_map_area
 
 
-class FeatureSettings(BaseModel, frozen=True, extra="forbid"):
+class FeatureSettings(ImageSettings, frozen=True, extra="forbid"):
     """Settings of an encoder that ends in one dense layer."""
 
     features: PositiveInt = Field(256, description="Width of the dense layer the encoder ends in.")
@@ -26,11 +27,13 @@ class FeatureSettings(BaseModel, frozen=True, extra="forbid"):
 class _ConvolutionsAndDense(nn.Module):
     """Image -> convolutions -> dense layer, with leaky ReLU after each."""
 
-    def __init__(self, space: Box, layers: Sequence[ConvLayer], features: int) -> None:
+    def __init__(self, space: Box, layers: Sequence[ConvLayer], settings: FeatureSettings) -> None:
         super().__init__()
-        self.convolutions = ConvolutionalEncoder(space, layers, "leaky_relu")
-        self.dense = dense(self.convolutions.features_dim, features)
-        self.features_dim = features
+        self.convolutions = ConvolutionalEncoder(
+            space, layers, "leaky_relu", settings.validity_channel
+        )
+        self.dense = dense(self.convolutions.features_dim, settings.features)
+        self.features_dim = settings.features
 
     def forward(self, raw: torch.Tensor) -> torch.Tensor:
         """Raw images (B, H, W, C) -> features (B, features_dim) float32."""
@@ -48,7 +51,7 @@ class Simple(_ConvolutionsAndDense):
         """Settings of the encoder ``simple``."""
 
     def __init__(self, space: Box, settings: Settings) -> None:
-        super().__init__(space, ((16, 8, 4), (32, 4, 2)), settings.features)
+        super().__init__(space, ((16, 8, 4), (32, 4, 2)), settings)
 
 
 class NatureCnn(_ConvolutionsAndDense):
@@ -62,7 +65,7 @@ class NatureCnn(_ConvolutionsAndDense):
         """Settings of the encoder ``nature_cnn``."""
 
     def __init__(self, space: Box, settings: Settings) -> None:
-        super().__init__(space, ((32, 8, 4), (64, 4, 2), (64, 3, 1)), settings.features)
+        super().__init__(space, ((32, 8, 4), (64, 4, 2), (64, 3, 1)), settings)
 
 
 class ResidualBlock(nn.Module):
@@ -105,7 +108,7 @@ class ResNet(nn.Module):
 
     def __init__(self, space: Box, settings: Settings) -> None:
         super().__init__()
-        self.input = image_input(space)
+        self.input = image_input(space, settings.validity_channel)
         # The convolutions pad, so that the pooling alone makes the image smaller.
         area = feature_map_area(space, [self.POOLING] * len(self.CHANNELS), "the encoder 'resnet'")
         self.stacks = nn.Sequential()
@@ -128,10 +131,10 @@ class FullyConnected(nn.Module):
     """Encoder ``fully_connected``: an image or a vector, flattened, through dense layers.
 
     Raises:
-        ValueError: The space holds neither images nor vectors.
+        ValueError: The space holds neither images nor vectors, or has no pixels to be missing.
     """
 
-    class Settings(BaseModel, frozen=True, extra="forbid"):
+    class Settings(ImageSettings, frozen=True, extra="forbid"):
         """Settings of the encoder ``fully_connected``."""
 
         num_layers: PositiveInt = Field(1, description="Number of dense layers.")
@@ -139,8 +142,11 @@ class FullyConnected(nn.Module):
 
     def __init__(self, space: Box, settings: Settings) -> None:
         super().__init__()
-        self.input = image_input(space) if len(space.shape) == 3 else vector_input(space)
-        width = torch.Size(space.shape).numel()
+        is_image, doubled = len(space.shape) == 3, settings.validity_channel
+        if doubled and not is_image:
+            raise ValueError("validity_channel: a vector has no pixels to be missing: leave it out")
+        self.input = image_input(space, doubled) if is_image else vector_input(space)
+        width = math.prod(space.shape) * (2 if doubled else 1)
         self.dense = nn.Sequential()
         for _ in range(settings.num_layers):
             self.dense.append(dense(width, settings.hidden_units))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -11,7 +12,13 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import torch
 
+# The code of a pixel whose depth is not known, as real depth cameras have it.
+NOTHING_SEEN = 0
+# Of pictures for people: no depth has it.
+NOTHING_SEEN_RGB = (128, 128, 128)
 MM_PER_M = 1000
+# Of codes, whose number floating-point arithmetic may miss by a little.
+ROUNDING = 1e-6
 UINT8_MAX = 255
 UINT16_MAX = 65535
 
@@ -25,8 +32,10 @@ class DepthImage(Box):
     - ``uint8``: ``value_m = min + value * (max - min) / 255``
       ("Learning to Grasp from 2.5D images", equation *clamp*).
 
-    The space holds every value of its type, because a real camera reports 0 where it sees nothing
-    and goes beyond its nominal range; ``decode`` clamps them.
+    **0 is "nothing seen"** in both, as real depth cameras say it: of what is missing, and of what
+    is nearer or farther than the range. The space holds every value of its type, because a real
+    camera goes beyond its nominal range; ``seen`` tells which of them are depths, and ``decode``
+    puts all others at the far end.
 
     Args:
         height: Rows of the image.
@@ -35,6 +44,11 @@ class DepthImage(Box):
         encoding: What one number of the image stands for.
         focal_length_px: Of the pinhole camera, whose axis goes through the image's middle, for
             encoders that need to know it; None where it is unknown.
+
+    Attributes:
+        codes: First and last of those that stand for a depth in the range.
+        zero_m: Depth whose code would be 0.
+        codes_per_m: ``code = (depth_m - zero_m) * codes_per_m``, rounded and held within ``codes``.
 
     Raises:
         ValueError: The size, the range or the encoding makes no sense.
@@ -65,32 +79,41 @@ class DepthImage(Box):
             raise ValueError(
                 f"a focal length of {focal_length_px} pixels must be finite and over 0"
             )
-        high, dtype = (UINT8_MAX, np.uint8) if encoding == "uint8" else (UINT16_MAX, np.uint16)
-        super().__init__(0, high, shape=(height, width, 1), dtype=dtype)
+        top, dtype = (UINT8_MAX, np.uint8) if encoding == "uint8" else (UINT16_MAX, np.uint16)
+        super().__init__(0, top, shape=(height, width, 1), dtype=dtype)
         self.range_m = (min_m, max_m)
         self.encoding = encoding
         self.focal_length_px = focal_length_px
+        self.zero_m = min_m if encoding == "uint8" else 0.0
+        self.codes_per_m = UINT8_MAX / (max_m - min_m) if encoding == "uint8" else float(MM_PER_M)
+        low, high = ((end - self.zero_m) * self.codes_per_m for end in self.range_m)
+        first, last = math.ceil(low - ROUNDING), math.floor(high + ROUNDING)
+        self.codes = (max(first, NOTHING_SEEN + 1), last)
+        if self.codes[0] > last:
+            raise ValueError(
+                f"depth range [{min_m}, {max_m}] m holds no whole millimetre, which uint16 counts: "
+                "widen it or use the encoding 'uint8'"
+            )
 
     def encode(self, metres: NDArray[np.floating]) -> NDArray[np.integer]:
         """Encodes depths as the camera would.
 
         Args:
-            metres: Depths in metres, (..., height, width); infinite where nothing was hit, not NaN.
+            metres: Depths in metres, (..., height, width); infinite where nothing was hit.
 
         Returns:
-            Clamped to the range and rounded, (..., height, width, 1), of the space's type.
+            Rounded, and 0 outside the range, (..., height, width, 1), of the space's type.
         """
         min_m, max_m = self.range_m
-        values = np.clip(metres, min_m, max_m)
-        if self.encoding == "uint8":
-            values -= min_m
-            values *= UINT8_MAX / (max_m - min_m)
-        else:
-            values *= MM_PER_M
-        return np.rint(values, out=values).astype(self.dtype)[..., np.newaxis]
+        values = np.subtract(metres, self.zero_m)
+        values *= self.codes_per_m
+        # Not 0 but 1 for what rounds to it: only what is outside the range is "nothing seen".
+        np.rint(values, out=values).clip(*self.codes, out=values)
+        np.copyto(values, NOTHING_SEEN, where=~((metres >= min_m) & (metres <= max_m)))
+        return values.astype(self.dtype)[..., np.newaxis]
 
     def decode(self, raw: torch.Tensor) -> torch.Tensor:
-        """Turns raw images into metres, clamped to the range.
+        """Turns raw images into metres within the range; "nothing seen" lies at its far end.
 
         Args:
             raw: Encoded depths of any shape, of the space's type.
@@ -98,16 +121,49 @@ class DepthImage(Box):
         Returns:
             Depths in metres, of the same shape, float32.
         """
-        min_m, max_m = self.range_m
+        return self.decode_seen(raw).clamp_(max=self.range_m[1])
+
+    def decode_seen(self, raw: torch.Tensor) -> torch.Tensor:
+        """As `decode`, but infinite where nothing was seen."""
+        from torch.nn.functional import threshold  # noqa: PLC0415
+
+        first, last = self.codes
         # torch has next to no arithmetic on uint16, so leave it first. What follows is in place: a
-        # copy of all pixels for each operation would cost more than the operations.
-        metres = raw.float()
-        if self.encoding == "uint8":
-            # The paper's equation "clamp", as in the docstring of the class.
-            metres.mul_((max_m - min_m) / UINT8_MAX).add_(min_m)
-        else:
-            metres.div_(MM_PER_M)
-        return metres.clamp_(min_m, max_m)
+        # copy of all pixels for each operation would cost more than the operations. A threshold
+        # takes a quarter of the time of a comparison and a masked fill.
+        metres = threshold(raw.float(), first - 0.5, math.inf, inplace=True)
+        if self.encoding == "uint16":  # whose codes go on beyond the last
+            threshold(metres.neg_(), -last - 0.5, -math.inf, inplace=True).neg_()
+        metres.div_(self.codes_per_m)
+        return metres.add_(self.zero_m) if self.zero_m else metres
+
+    def seen(self, raw: torch.Tensor) -> torch.Tensor:
+        """Tells which pixels are depths inside the range.
+
+        Args:
+            raw: Encoded depths of any shape, of the space's type.
+
+        Returns:
+            Of the same shape, bool.
+        """
+        return self.decode_seen(raw).isfinite()
+
+    def picture(self, frame: NDArray[np.integer]) -> NDArray[np.uint8]:
+        """Draws one raw image (height, width, 1) for people.
+
+        Returns:
+            RGB (height, width, 3): near is warm, far is cold, "nothing seen" is gray.
+        """
+        # Here, because simulators' processes import this module and do without.
+        import cv2  # noqa: PLC0415
+
+        first, last = self.codes
+        codes = frame[..., 0].astype(np.float64)
+        nearness = ((last - codes) / max(last - first, 1)).clip(0.0, 1.0)
+        levels = np.rint(nearness * UINT8_MAX).astype(np.uint8)
+        rgb = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
+        rgb[(codes < first) | (codes > last)] = NOTHING_SEEN_RGB
+        return np.asarray(rgb, np.uint8)
 
     def __eq__(self, other: Any) -> bool:
         """Two depth spaces are equal when their numbers mean the same, too."""
@@ -145,6 +201,10 @@ class RgbImage(Box):
     def __init__(self, height: int, width: int) -> None:
         _check_size(height, width)
         super().__init__(0, UINT8_MAX, shape=(height, width, 3), dtype=np.uint8)
+
+    def picture(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Draws one image (height, width, 3) for people: as it is."""
+        return frame
 
     def __repr__(self) -> str:
         """Gives the size; everything else is fixed."""

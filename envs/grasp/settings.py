@@ -43,12 +43,16 @@ class Camera(BaseModel, frozen=True, extra="forbid"):
     noise_sigma_m: float = Field(
         0.002, ge=0.0, le=1.0, description="Depth only: sigma of the Gaussian noise."
     )
+    missing_fraction: Range = Field(
+        (0.0, 0.0),
+        description="Depth only: probability of each pixel to be missing, drawn at every reset.",
+    )
     encoding: Literal["uint16", "uint8"] = Field(
         "uint16", description="Depth only: uint16 millimetres, or uint8 over the range."
     )
 
     @model_validator(mode="after")
-    def _geometry_is_possible(self) -> Camera:
+    def _is_possible(self) -> Camera:
         if self.position_m == self.target_m:
             raise ValueError("position_m and target_m are the same point: the camera looks nowhere")
         if self.near_m[0] <= 0.0 or self.near_m[1] >= self.far_m[0]:
@@ -57,6 +61,11 @@ class Camera(BaseModel, frozen=True, extra="forbid"):
             )
         if self.range_m[0] < 0.0 or self.range_m[0] == self.range_m[1]:
             raise ValueError(f"range_m {list(self.range_m)} must be a non-empty, positive range")
+        if self.missing_fraction[0] < 0.0 or self.missing_fraction[1] > 1.0:
+            raise ValueError(
+                f"missing_fraction {list(self.missing_fraction)} is of probabilities: keep it "
+                "within 0 and 1"
+            )
         if self.encoding == "uint16" and self.range_m[1] > 65.535:
             raise ValueError(
                 f"range_m reaches {self.range_m[1]} m, over uint16's 65.535 m: lower it, or use "

@@ -30,6 +30,8 @@ from rewards.grasp.transition import GraspTransition
 from rewards.reward import RewardTerm, fitting, weigh
 
 GOAL_PARAMETERS = ("lateral_limit_m", "vertical_limit_m", "gap_limit_m", "yaw_limit_deg")
+# Those of the depth cameras' sensors, and what a sampler's numbers are clipped to.
+SENSOR_PARAMETERS = {"noise_sigma_m": (0.0, np.inf), "missing_fraction": (0.0, 1.0)}
 
 
 class GraspVectorEnv(Environment):
@@ -49,7 +51,7 @@ class GraspVectorEnv(Environment):
     Settings = GraspSettings
     snapshot: ClassVar[type[GraspTransition]] = GraspTransition
     parameter_names: ClassVar[frozenset[str]] = frozenset(
-        {*GOAL_PARAMETERS, "noise_sigma_m", "block_yaw_limit_deg"}
+        {*GOAL_PARAMETERS, *SENSOR_PARAMETERS, "block_yaw_limit_deg"}
     )
     evaluation_episodes: ClassVar[int] = 1000
     evaluation_options: ClassVar[tuple[EvaluationOption, ...]] = EVALUATION_OPTIONS
@@ -216,9 +218,12 @@ class GraspVectorEnv(Environment):
         limits = {name: given[name] for name in GOAL_PARAMETERS if name in given}
         yaw_limit_rad = np.radians(given.get("block_yaw_limit_deg", np.full(n, 180.0)))
         scenes, views = self._sampler.sample(self._rng, yaw_limit_rad)
-        if "noise_sigma_m" in given:
-            sigma_m = np.maximum(given["noise_sigma_m"], 0.0)
-            views = {k: view.with_arrays({"noise_sigma_m": sigma_m}) for k, view in views.items()}
+        sensor = {
+            name: given[name].clip(*ends)
+            for name, ends in SENSOR_PARAMETERS.items()
+            if name in given
+        }
+        views = {name: view.with_arrays(sensor) for name, view in views.items()}
         tools = self._arm.home(n)
         self._simulator.load(indices, scenes, tools.joints_rad)
         begun = RunningEpisodes(

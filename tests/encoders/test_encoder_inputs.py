@@ -1,11 +1,13 @@
 """From raw observations to what a network takes."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
 
-from encoders.inputs import image_input, vector_input
+from encoders.inputs import fill_gaps, image_input, vector_input
 from encoders.spaces import DepthImage, RgbImage
 
 
@@ -27,13 +29,60 @@ def test_depth_is_scaled_over_the_range():
     scaled = module(raw.reshape(1, 1, 6, 1))
     assert module.channels == 1
     assert scaled.shape == (1, 1, 1, 6)
-    assert scaled.flatten().tolist() == pytest.approx([0, 0, 0.25, 0.5, 1, 1], abs=1e-6)
+    assert scaled.flatten().tolist() == pytest.approx([1, 0, 0.25, 0.5, 1, 1], abs=1e-6)
 
 
 def test_depth_bytes_are_scaled_over_the_range():
     module = image_input(DepthImage(1, 3, (0.5, 0.9), "uint8"))
     scaled = module(torch.tensor([0, 51, 255], dtype=torch.uint8).reshape(1, 1, 3, 1))
-    assert scaled.flatten().tolist() == pytest.approx([0, 0.2, 1], abs=1e-6)
+    assert scaled.flatten().tolist() == pytest.approx([1, 0.2, 1], abs=1e-6)
+
+
+def test_the_validity_channel_tells_depths_from_nothing_seen():
+    module = image_input(DepthImage(1, 5), validity_channel=True)
+    raw = torch.from_numpy(np.array([0, 399, 400, 2000, 2001], dtype=np.uint16))
+    scaled = module(raw.reshape(1, 1, 5, 1))
+    assert module.channels == 2
+    assert scaled.shape == (1, 2, 1, 5)
+    assert scaled[0, 0, 0].tolist() == pytest.approx([1, 1, 0, 1, 1], abs=1e-6)
+    assert scaled[0, 1, 0].tolist() == [0, 0, 1, 1, 0]
+
+
+def test_only_depth_has_a_validity_channel():
+    with pytest.raises(ValueError, match=r"validity_channel.*RgbImage\(4, 5\)"):
+        image_input(RgbImage(4, 5), validity_channel=True)
+
+
+INF = math.inf
+
+
+def test_a_gap_gets_the_depth_of_the_line_through_it_that_is_nearest():
+    # rows (4, 6), columns (2, 9), diagonals (1, 8) and (3, 7): the farther ends are 6, 9, 8, 7
+    depth_m = torch.tensor([[[1.0, 2.0, 3.0], [4.0, INF, 6.0], [7.0, 9.0, 8.0]]])
+    assert fill_gaps(depth_m)[0, 1, 1] == 6
+    depth_m[0, 1, 2] = INF
+    assert fill_gaps(depth_m)[0].tolist() == [[1, 2, 3], [4, 7, 8], [7, 9, 8]]
+
+
+def test_a_gap_between_no_two_depths_stays():
+    depth_m = torch.full((1, 4, 4), INF)
+    depth_m[0, 1, 1] = depth_m[0, 0, 0] = 1.0
+    assert torch.equal(fill_gaps(depth_m), depth_m)
+
+
+@pytest.mark.parametrize("angle_deg", range(0, 360, 7))
+@pytest.mark.parametrize("beyond_m", [1.5, INF])
+def test_straight_edges_stay_where_they_are(angle_deg, beyond_m):
+    rows, columns = np.mgrid[:21, :21] - 10.0
+    angle = np.radians(angle_deg)
+    distance_px = rows * np.cos(angle) + columns * np.sin(angle) - 0.3
+    edge = torch.from_numpy(np.where(distance_px < 0, 0.8, beyond_m))[None]
+    assert torch.equal(fill_gaps(edge), edge)
+    for row, column in np.argwhere(np.ones((17, 17))) + 2:  # each pixel missing, one by one
+        holed = edge.clone()
+        holed[0, row, column] = INF
+        own_side = fill_gaps(holed)[0, row, column] == edge[0, row, column]
+        assert own_side or -0.55 < distance_px[row, column] < 0
 
 
 def test_floats_stay_as_they_are():

@@ -28,15 +28,17 @@ def images(space, batch):
     return torch.from_numpy(rng.integers(0, high, (batch, *space.shape)).astype(space.dtype))
 
 
+def _builder(cls, **settings):
+    return lambda space, **more: cls(space, cls.Settings(**settings, **more))
+
+
 ENCODERS = {
-    "conv": lambda space: conv(space, [[4, 8, 4], [6, 3, 1]]),
-    "paper": lambda space: Paper(space, Paper.Settings(size=80)),
-    "simple": lambda space: Simple(space, Simple.Settings(features=12)),
-    "nature_cnn": lambda space: NatureCnn(space, NatureCnn.Settings(features=12)),
-    "resnet": lambda space: ResNet(space, ResNet.Settings(features=12)),
-    "fully_connected": lambda space: FullyConnected(
-        space, FullyConnected.Settings(num_layers=2, hidden_units=12)
-    ),
+    "conv": _builder(Conv, layers=[[4, 8, 4], [6, 3, 1]]),
+    "paper": _builder(Paper, size=80),
+    "simple": _builder(Simple, features=12),
+    "nature_cnn": _builder(NatureCnn, features=12),
+    "resnet": _builder(ResNet, features=12),
+    "fully_connected": _builder(FullyConnected, num_layers=2, hidden_units=12),
 }
 CONVOLUTIONAL = [name for name in ENCODERS if name != "fully_connected"]
 
@@ -106,16 +108,32 @@ def test_an_image_is_encoded_alike_alone_and_in_a_batch(name):
 
 @pytest.mark.parametrize("name", ENCODERS)
 def test_real_cameras_need_no_preprocessing(name):
-    """No return (0) counts as the range's start, anything far as its end."""
+    """Whatever lies outside the range counts as nothing seen, for which 0 stands."""
     space = DepthImage(40, 40)
     raw = images(space, 1).to(torch.int32)
-    raw[:, :9], raw[:, 9:18] = 0, 65535
-    clamped = raw.clone()
-    clamped[:, :9], clamped[:, 9:18] = 400, 2000
+    raw[:, :9], raw[:, 9:18] = 399, 65535
+    zeroed = torch.where((raw < 400) | (raw > 2000), 0, raw)
     encoder = ENCODERS[name](space)
     torch.testing.assert_close(
-        encoder(raw.to(torch.uint16)), encoder(clamped.to(torch.uint16)), rtol=0, atol=0
+        encoder(raw.to(torch.uint16)), encoder(zeroed.to(torch.uint16)), rtol=0, atol=0
     )
+
+
+@pytest.mark.parametrize("name", ENCODERS)
+def test_with_its_validity_channel_an_encoder_tells_nothing_seen_from_the_far_end(name):
+    space = DepthImage(40, 40)
+    far, missing = torch.full((1, 40, 40, 1), 2000), torch.zeros(1, 40, 40, 1)
+    encoders = {"off": ENCODERS[name](space), "on": ENCODERS[name](space, validity_channel=True)}
+    differ = {}
+    for channel, encoder in encoders.items():
+        features = [encoder(image.to(torch.uint16)) for image in (far, missing)]
+        differ[channel] = not torch.allclose(*features)
+    assert differ == {"off": False, "on": True}
+
+
+def test_a_vector_has_no_validity_channel():
+    with pytest.raises(ValueError, match="validity_channel: a vector has no pixels"):
+        FullyConnected(VECTOR, FullyConnected.Settings(validity_channel=True))
 
 
 def test_conv_is_a_sum_over_windows_then_the_activation():

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from encoders.inputs import fill_gaps
 from encoders.keypoints import Keypoints
 from encoders.spaces import DepthImage, RgbImage
 
@@ -13,14 +16,14 @@ SPACE = DepthImage(16, 24, (0.4, 2.0), focal_length_px=FOCAL_PX)
 MIDDLE_M = np.sqrt(0.4 * 2.0)
 
 
-def make(space=SPACE, **settings):
+def make(space=SPACE, **other):
     torch.manual_seed(0)
-    return Keypoints(space, Keypoints.Settings(keypoints=3, patch=4, stride=2, **settings))
+    return Keypoints(space, Keypoints.Settings(keypoints=3, patch=4, stride=2, **other))
 
 
-def attending_to_all(**settings):
+def attending_to_all():
     """An encoder whose attention is the same everywhere."""
-    encoder = make(**settings)
+    encoder = make()
     torch.nn.init.zeros_(encoder.attention.weight)
     return encoder
 
@@ -115,6 +118,71 @@ def test_bfloat16_moves_keypoints_by_little():
     exact, _ = places(make()(raw(depth_m)))
     lowered, _ = places(make(precision="bfloat16")(raw(depth_m)))
     assert 0 < np.abs(exact - lowered).max() < 0.01
+
+
+def tilted():
+    """A face turned by some 30 degrees, before a wall."""
+    rows, columns = np.mgrid[:16, :24]
+    depth_m = 0.9 + 0.02 * columns + 0.004 * rows
+    depth_m[:, 17:] = 1.6
+    return depth_m
+
+
+def with_holes(images, missing):
+    """Raw images in which nothing is seen at some pixels."""
+    return images.view(torch.int16).masked_fill(missing, 0).view(torch.uint16)
+
+
+@pytest.mark.parametrize("encoding", ["uint16", "uint8"])
+@pytest.mark.parametrize("far_m", [1.6, 2.0])
+def test_the_far_end_of_the_range_is_seen_in_both_encodings(encoding, far_m):
+    space = DepthImage(16, 24, (0.4, far_m), encoding, FOCAL_PX)
+    depth_m = np.full((1, 16, 24), far_m, np.float32)
+    with torch.no_grad():
+        depth_m = space.decode_seen(torch.from_numpy(space.encode(depth_m)))[..., 0]
+        *_, seen = make(space)._look(depth_m)
+    assert seen.all()
+
+
+@given(row=st.integers(0, 15), column=st.integers(0, 23))
+@settings(max_examples=40, deadline=None)
+def test_a_missing_pixel_is_neutral(row, column):
+    missing = torch.zeros(1, 16, 24, 1, dtype=torch.bool)
+    missing[0, row, column] = True
+    image, encoder = raw(tilted()), attending_to_all()
+    depths_m = [
+        fill_gaps(SPACE.decode_seen(one)[..., 0]) for one in (image, with_holes(image, missing))
+    ]
+    (shapes, points, _), (found_shapes, found_points, seen) = map(encoder._look, depths_m)
+    assert seen.all()  # no middle is in a corner, where nothing could be filled in
+    # A step of depth between neighbours is 24 mm at most, or that of the edge at column 17.
+    at_edge = column in (16, 17)
+    limit_m = 0.5 if at_edge else 0.0241
+    assert (points - found_points).abs().max() <= 10 * limit_m
+    if not (at_edge or (row in (0, 15) and column in (0, 23))):
+        assert (shapes - found_shapes).abs().max() <= 0.0241 / 0.05
+    features, found = (encoder(one) for one in (image, with_holes(image, missing)))
+    assert (features - found).abs().max() < 0.1
+
+
+def test_one_missing_pixel_in_ten_moves_the_mean_of_points_by_a_few_millimetres():
+    images, rng = raw(tilted()).expand(64, -1, -1, -1), np.random.default_rng(0)
+    holed = with_holes(images, torch.from_numpy(rng.random(images.shape) < 0.1))
+    whole, found = (places(attending_to_all()(one))[0] for one in (images, holed))
+    error_m = np.linalg.norm(whole - found, axis=-1)
+    assert 0.0 < np.median(error_m) < 0.003
+    assert error_m.max() < 0.02
+
+
+def test_a_middle_that_can_not_be_filled_in_gets_no_attention():
+    missing = torch.zeros(1, 16, 24, 1, dtype=torch.bool)
+    missing[0, :, 12:] = True
+    holed = with_holes(raw(np.full((16, 24), 0.9)), missing)
+    place, covariance = places(attending_to_all()(holed))
+    points = middles(np.full((16, 24), 0.9)).reshape(8, 12, 3)[:, :6].reshape(-1, 3)
+    np.testing.assert_allclose(place[0, 0], points.mean(0), atol=1e-5)
+    expected = np.cov(points.T, bias=True)[np.triu_indices(3)].clip(-0.03, 0.03)
+    np.testing.assert_allclose(covariance[0, 0], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from encoders.spaces import NOTHING_SEEN
 from envs.grasp.evaluation.pick import CUP_RADIUS_M, Outcome
 from envs.grasp.evaluation.pose_errors import PoseErrors, Sample, outcome_label
 from envs.grasp.scene.sampler import heading
@@ -25,6 +27,7 @@ COLUMNS = 6
 STEM_M = 0.08
 RIM_POINTS = 48
 TRUE_COLOR, AIM_COLOR = "white", "magenta"
+NOTHING_SEEN_COLOR = "gray"
 GOOD_COLOR, BAD_COLOR = "tab:green", "tab:red"
 OUTCOME_COLORS = {
     "": "tab:blue",
@@ -129,16 +132,20 @@ def workspace(judged: PoseErrors) -> bytes:
 
 
 def _show(axes: Axes, image: NDArray[Any]) -> None:
-    """Shows an image (H, W, C), its pixels' corners at whole numbers; a depth with near as red."""
+    """Shows an image (H, W, C), its pixels' corners at whole numbers.
+
+    Of depth, near is red, and what was not seen is gray.
+    """
     height, width, channels = image.shape
     place: dict[str, Any] = {"extent": (0, width, height, 0), "interpolation": "nearest"}
     if channels == 3:
         axes.imshow(image, **place)
     else:
-        # The colors are for what is near: the empty distance, clamped to the sensor's end, is not.
-        near = image[image < image.max()]
-        high = np.percentile(near, FARTHEST_PERCENTILE) if len(near) else image.max()
-        axes.imshow(image[..., 0], cmap="turbo_r", vmin=image.min(), vmax=high, **place)
+        depth = np.ma.masked_equal(image[..., 0], NOTHING_SEEN)
+        seen = depth.compressed() if depth.count() else np.ones(1)
+        colors = colormaps["turbo_r"].with_extremes(bad=NOTHING_SEEN_COLOR)
+        high = np.percentile(seen, FARTHEST_PERCENTILE)
+        axes.imshow(depth, cmap=colors, vmin=seen.min(), vmax=high, **place)
     axes.set(xlim=(0, width), ylim=(height, 0))
 
 

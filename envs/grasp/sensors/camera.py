@@ -1,4 +1,4 @@
-"""The pinhole camera and the depth sensor's model.
+"""The pinhole camera.
 
 Camera axes are OpenCV's: x to the right, y down, z forward; depth is measured along z. Pixel
 (column c, row r) looks along the ray through its centre, (c + 0.5, r + 0.5) from the top left.
@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from encoders.spaces import DepthImage
 from envs.grasp.batch import Batch
 from envs.grasp.settings import Camera
 
@@ -29,6 +28,7 @@ class CameraPoses(Batch):
         rotation: (n, 3, 3) whose columns are the camera's axes in the world frame.
         near_m, far_m: (n,) clip planes.
         noise_sigma_m: (n,) sigma of a depth camera's noise.
+        missing_fraction: (n,) probability that a depth camera misses a pixel.
     """
 
     camera: Camera
@@ -37,6 +37,7 @@ class CameraPoses(Batch):
     near_m: Floats
     far_m: Floats
     noise_sigma_m: Floats
+    missing_fraction: Floats
 
 
 # Outside, with the whole robot and the support in view.
@@ -101,6 +102,7 @@ def sample_views(
         rng.uniform(*camera.near_m, n),
         rng.uniform(*camera.far_m, n),
         np.full(n, camera.noise_sigma_m),
+        rng.uniform(*camera.missing_fraction, n),
     )
 
 
@@ -120,30 +122,3 @@ def project(views: CameraPoses, points_m: Floats) -> Floats:
     u = camera.width / 2.0 + focal * local[..., 0] / safe
     v = camera.height / 2.0 + focal * local[..., 1] / safe
     return np.stack([u, v, depth], axis=-1)
-
-
-def sense_depth(
-    depth_m: NDArray[np.float32],
-    space: DepthImage,
-    noise_sigma_m: Floats,
-    seeds: NDArray[np.uint64],
-) -> NDArray[Any]:
-    """The sensor's model: true depth -> Gaussian noise -> clamp -> encoding.
-
-    Args:
-        depth_m: (n, H, W) true depth, infinite where nothing is hit.
-        space: the observation space, which clamps and encodes.
-        noise_sigma_m: (n,) sigma of the noise.
-        seeds: (n,) of the noise, one for each picture, so that it does not matter which process
-            takes the picture, or when.
-
-    Returns:
-        (n, H, W, 1) in the space's type.
-    """
-    noisy = np.empty_like(depth_m)
-    for row, seed in enumerate(seeds):
-        rng = np.random.Generator(np.random.SFC64(int(seed)))
-        rng.standard_normal(out=noisy[row], dtype=np.float32)
-    noisy *= noise_sigma_m[:, None, None].astype(np.float32)
-    noisy += depth_m
-    return space.encode(noisy)

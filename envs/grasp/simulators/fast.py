@@ -11,19 +11,16 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from encoders.spaces import MM_PER_M, UINT8_MAX, DepthImage
+from encoders.spaces import DepthImage
 from envs.grasp.robot.urdf import Box, Robot, load_robot
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses, focal_length_px
+from envs.grasp.sensors.depth import Sensor, sensor_of
 from envs.grasp.settings import Support
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
 from envs.grasp.simulators.colors import BLOCK_RGBA, SUPPORT_RGBA
 from envs.grasp.simulators.kernels.contacts import touch_along
-from envs.grasp.simulators.kernels.pictures import (
-    Sensor,
-    ViewArrays,
-    take_pictures,
-)
+from envs.grasp.simulators.kernels.pictures import ViewArrays, take_pictures
 from envs.grasp.simulators.kernels.worlds import RobotArrays, WorldArrays
 from envs.grasp.simulators.thread_pool import ThreadPool
 
@@ -33,7 +30,7 @@ ORTHONORMAL_TOLERANCE = 1e-6
 NO_DEPTHS = np.empty((0, 0, 0), np.float32)
 NO_COLORS = np.empty((0, 0, 0, 3), np.uint8)
 NO_CODES = np.empty((0, 0, 0), np.uint16)
-NO_SENSOR = Sensor(np.empty(0), np.empty(0, np.uint64), 0.0, 0.0, 0.0, 0.0)
+NO_SENSOR = Sensor(np.empty(0, np.uint64), np.empty(0), np.empty(0), 0.0, 0.0, 0.0, 0.0, 0, 0)
 
 
 class FastSimulator:
@@ -133,9 +130,8 @@ class FastSimulator:
             )
         if np.shape(seeds) != indices.shape:
             raise ValueError(f"{len(indices)} pictures need as many seeds, not {np.shape(seeds)}")
-        _check(views.noise_sigma_m, indices.shape, "noise_sigma_m")
         codes = np.empty((len(indices), arrays.height, arrays.width), np.uint16)
-        sensor = _sensor(views.noise_sigma_m, seeds, space)
+        sensor = sensor_of(views, space, seeds)
         self._take_pictures(indices, arrays, sensor, NO_DEPTHS, NO_COLORS, codes)
         return codes[..., None].astype(space.dtype, copy=False)
 
@@ -294,20 +290,6 @@ def _view_arrays(views: CameraPoses, n: int) -> ViewArrays:
         focal_length_px(camera),
         camera.width,
         camera.height,
-    )
-
-
-def _sensor(sigma_m: Floats, seeds: NDArray[np.uint64], space: DepthImage) -> Sensor:
-    """The sensor of n pictures, with what `DepthImage.encode` does in numbers."""
-    low, high = space.range_m
-    zero, scale = (low, UINT8_MAX / (high - low)) if space.encoding == "uint8" else (0.0, MM_PER_M)
-    return Sensor(
-        np.ascontiguousarray(sigma_m, np.float64),
-        np.ascontiguousarray(seeds, np.uint64),
-        low,
-        high,
-        zero,
-        float(scale),
     )
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import CameraPoses, focal_length_px, sense_depth
+from envs.grasp.sensors.camera import CameraPoses, focal_length_px
+from envs.grasp.sensors.depth import sense_depth
 from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
 from envs.grasp.simulators.bodies import (
@@ -85,7 +86,7 @@ class PyBulletSimulator:
         self, indices: Indices, views: CameraPoses, space: DepthImage, seeds: NDArray[np.uint64]
     ) -> Images:
         """See `Simulator.render_depth`."""
-        return sense_depth(self.render(indices, views), space, views.noise_sigma_m, seeds)
+        return sense_depth(self.render(indices, views), views, space, seeds)
 
     def close(self) -> None:
         """See `Simulator.close`."""

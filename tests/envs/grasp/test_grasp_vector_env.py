@@ -138,8 +138,10 @@ def test_spaces_contain_what_is_delivered(make: MakeEnv, frame_grab: bool) -> No
 def test_images_lie_in_the_cameras_range(make: MakeEnv) -> None:
     observations, _ = make(8).reset(seed=0)
     depth = observations["depth"]
-    assert depth.min() >= 400
-    assert depth.max() <= 2000
+    seen = depth[depth > 0]  # what lies behind the table is beyond the range
+    assert seen.min() >= 400
+    assert seen.max() <= 2000
+    assert 0.0 < (depth == 0).mean() < 0.6
     assert ((depth > 500) & (depth < 1500)).mean() > 0.3  # mostly table and blocks
     assert (np.abs(depth[0].astype(int) - depth[1].astype(int)) > 10).mean() > 0.05
 
@@ -397,7 +399,9 @@ def test_the_stream_shows_the_robot(make: MakeEnv) -> None:
     first, _ = env.reset(seed=0)
     # Beside the target and off the table: the arm hides what was farther away.
     second, *_ = env.step(np.tile([0.0, 0.0, 0.6, 0.0], (4, 1)))
-    nearer = second["depth"].astype(int) < first["depth"].astype(int) - 50
+    images = first["depth"], second["depth"]
+    before, after = (np.where(depth, depth, 3000).astype(int) for depth in images)
+    nearer = after < before - 50
     assert (nearer.mean((1, 2, 3)) > 0.02).all()
 
 
@@ -488,6 +492,34 @@ def test_the_sensors_noise_is_a_parameter(make: MakeEnv) -> None:
         deviations[sigma] = difference[inside].std()
     assert deviations[0.0] == 0.0
     assert deviations[0.02] == pytest.approx(20 * np.sqrt(2), rel=0.05)
+
+
+def test_pixels_go_missing_by_parameter_and_by_setting(make: MakeEnv) -> None:
+    camera = {"type": "depth", "width": 32, "height": 24, "missing_fraction": (0.2, 0.8)}
+    env = make(64, cameras={"depth": camera})
+    first, _ = env.reset(seed=0)
+    share = env.state_dict()["views"]["depth"]["missing_fraction"]
+    assert 0.2 <= share.min() < 0.25
+    assert 0.75 < share.max() <= 0.8
+    env.set_parameters({"missing_fraction": 0.0})
+    whole, _ = env.reset(seed=0)  # the same scenes, cameras and noise
+    seen = whole["depth"] > 0
+    missing = ((first["depth"] == 0) & seen).sum((1, 2, 3)) / seen.sum((1, 2, 3))
+    np.testing.assert_allclose(missing, share, atol=0.15)
+    kept = first["depth"] > 0
+    np.testing.assert_array_equal(first["depth"][kept], whole["depth"][kept])
+
+
+def test_a_drawn_share_of_missing_pixels_is_one(make: MakeEnv) -> None:
+    env = make(32)
+    wide = GaussianParameters(mean=0.5, st_dev=2.0)
+    sampler = GaussianSampler(sampler_type="gaussian", sampler_parameters=wide)
+    env.set_parameters({"missing_fraction": sampler})
+    observations, _ = env.reset(seed=0)
+    share = env.state_dict()["views"]["depth"]["missing_fraction"]
+    assert (share.min(), share.max()) == (0.0, 1.0)
+    seen = (observations["depth"] > 0).any((1, 2, 3))
+    np.testing.assert_array_equal(seen, share < 1.0)
 
 
 def test_a_drawn_noise_is_never_negative(make: MakeEnv) -> None:

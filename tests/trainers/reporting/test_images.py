@@ -10,22 +10,12 @@ from encoders.spaces import DepthImage, RgbImage
 from trainers.reporting.images import picture
 
 
-@pytest.mark.parametrize("encoding", ["uint8", "uint16"])
-def test_near_is_warm_and_far_is_cold(encoding: str) -> None:
-    space = DepthImage(2, 2, (1.0, 40.0), encoding)  # type: ignore[arg-type]
-    metres = np.array([[1.0, 40.0], [20.5, 20.5]])
-    image = picture(space, space.encode(metres))
-    near, far, middle = image[0, 0].astype(int), image[0, -1].astype(int), image[-1, 0].astype(int)
-    assert near[0] > 100 > near[2]  # red
-    assert far[2] >= far[0]  # blue
-    assert middle[1] > max(near[1], far[1])  # green
-
-
-def test_depths_outside_the_range_look_like_its_ends() -> None:
-    space = DepthImage(2, 2, (0.5, 2.0))
-    image = picture(space, np.array([[0, 500], [2000, 65535]], np.uint16)[..., None])
-    assert (image[0, 0] == image[0, -1]).all()
-    assert (image[-1, 0] == image[-1, -1]).all()
+def test_a_space_of_pictures_draws_them_itself() -> None:
+    space = DepthImage(2, 3)
+    frame = np.array([[0, 500, 900], [2000, 65535, 1200]], np.uint16)[..., None]
+    image = picture(space, frame)
+    assert image.shape == (240, 360, 3)
+    np.testing.assert_array_equal(image[60::120, 60::120], space.picture(frame))
 
 
 def test_colors_stay_as_they_are_and_pixels_become_squares() -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.grasp.simulators.kernels.noise import fill_normals
+from envs.grasp.sensors.depth import Sensor, scratch, sense
 from envs.grasp.simulators.kernels.raster import (
     FAST,
     Canvas,
@@ -34,8 +34,6 @@ from envs.grasp.simulators.kernels.worlds import (
 )
 
 WHITE = 0xFFFFFF
-# What is not there lies so far away: finite, to be multiplied.
-NEVER_PER_M = np.float32(1e-9)
 
 
 class ViewArrays(NamedTuple):
@@ -57,26 +55,6 @@ class Eye(NamedTuple):
     right: Vector
     down: Vector
     forward: Vector
-
-
-class Sensor(NamedTuple):
-    """The depth sensor: its noise, range, and code = (depth - zero_m) * codes_per_m.
-
-    Attributes:
-        sigma_m: (n,) of the noise of each picture.
-        seeds: (n,) of the noise.
-        min_m: nearest depth.
-        max_m: farthest depth.
-        zero_m: depth of the code 0.
-        codes_per_m: codes in a metre.
-    """
-
-    sigma_m: Floats
-    seeds: NDArray[np.uint64]
-    min_m: float
-    max_m: float
-    zero_m: float
-    codes_per_m: float
 
 
 @kernel(nogil=True)
@@ -109,7 +87,7 @@ def take_pictures(
     """
     picture = canvas(views.height, views.width, len(colors) > 0)
     frames = np.empty((len(robot.parents), 3, 4))
-    normals = np.zeros((views.height * views.width + 1) // 2 * 2, np.float32)
+    normals, uniforms = scratch(views.height * views.width)
     for row in range(begin, end):
         _draw_world(picture, robot, worlds, indices[row], views, row, frames)
         if len(depths):
@@ -117,9 +95,7 @@ def take_pictures(
         if len(colors):
             _to_color(picture.colors, colors[row])
         if len(codes):
-            if sensor.sigma_m[row] > 0.0:
-                fill_normals(sensor.seeds[row], normals)
-            _to_codes(picture.inverse, normals, row, sensor, codes[row])
+            sense(picture.inverse, True, sensor, row, normals, uniforms, codes[row])
 
 
 @kernel()
@@ -135,23 +111,6 @@ def _to_depth(inverse: NDArray[np.float32], depth: NDArray[np.float32]) -> None:
     for pixel in range(len(depth)):
         value = inverse[pixel]
         depth[pixel] = np.float32(1.0) / value if value > np.float32(0.0) else np.float32(np.inf)
-
-
-@kernel(fastmath=FAST)
-def _to_codes(
-    inverse: NDArray[np.float32],
-    normals: NDArray[np.float32],
-    row: int,
-    sensor: Sensor,
-    codes: NDArray[np.uint16],
-) -> None:
-    """The sensor's model: true depth -> Gaussian noise -> clamp -> encoding."""
-    sigma = np.float32(sensor.sigma_m[row])
-    low, high = np.float32(sensor.min_m), np.float32(sensor.max_m)
-    zero, scale = np.float32(sensor.zero_m), np.float32(sensor.codes_per_m)
-    for pixel in range(len(codes)):
-        depth = np.float32(1.0) / max(inverse[pixel], NEVER_PER_M) + sigma * normals[pixel]
-        codes[pixel] = np.int32(np.rint((min(max(depth, low), high) - zero) * scale))
 
 
 @kernel()

@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from encoders.spaces import DepthImage
 from envs.grasp.sensors.camera import (
     CameraPoses,
     euler_rotations,
@@ -11,7 +10,6 @@ from envs.grasp.sensors.camera import (
     look_at,
     project,
     sample_views,
-    sense_depth,
 )
 from envs.grasp.settings import Camera
 
@@ -107,7 +105,7 @@ def test_euler_rotations_turn_about_x_then_y_then_z() -> None:
 
 
 def test_sampled_views_stay_in_their_ranges_and_use_them() -> None:
-    camera = Camera(type="depth", noise_sigma_m=0.004)
+    camera = Camera(type="depth", noise_sigma_m=0.004, missing_fraction=(0.1, 0.3))
     views = sample_views(camera, np.random.default_rng(0), 3000, 0.02, 3.0)
     moved = views.position_m - camera.position_m
     assert np.abs(moved).max() <= 0.02
@@ -121,86 +119,11 @@ def test_sampled_views_stay_in_their_ranges_and_use_them() -> None:
     relative = square.T @ views.rotation
     angle = np.degrees(np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1, 1)))
     assert 4.2 < angle.max() <= 3 * np.sqrt(3) + 0.1
-    for values, (low, high) in ((views.near_m, (0.05, 0.1)), (views.far_m, (2.5, 3.0))):
+    for values, (low, high) in (
+        (views.near_m, (0.05, 0.1)),
+        (views.far_m, (2.5, 3.0)),
+        (views.missing_fraction, (0.1, 0.3)),
+    ):
         assert low <= values.min() < low + 0.02 * (high - low)
         assert high - 0.02 * (high - low) < values.max() <= high
     np.testing.assert_array_equal(views.noise_sigma_m, 0.004)
-
-
-# -- the sensor ----------------------------------------------------------------------------------
-
-FLAT = np.full((1, 200, 300), 1.0, np.float32)
-
-
-def render_depth(
-    depth: np.ndarray, encoding: str = "uint16", sigma: float = 0.005, seed: int = 1
-) -> np.ndarray:
-    """Metres as they are delivered, from one picture."""
-    space = DepthImage(*depth.shape[1:], (0.4, 2.0), encoding)
-    raw = sense_depth(depth, space, np.array([sigma]), np.array([seed], np.uint64))
-    assert raw.shape == (*depth.shape, 1)
-    assert raw.dtype == space.dtype
-    raw = raw[..., 0].astype(float)
-    return raw / 1000 if encoding == "uint16" else 0.4 + raw * 1.6 / 255
-
-
-@pytest.mark.parametrize("encoding", ["uint16", "uint8"])
-def test_noise_is_gaussian_around_the_true_depth(encoding: str) -> None:
-    sigma = 0.02  # some steps of the coarse encoding
-    error = render_depth(FLAT, encoding, sigma) - 1.0
-    step = 0.001 if encoding == "uint16" else 1.6 / 255
-    spread = np.sqrt(sigma**2 + step**2 / 12)  # the rounding's own is uniform
-    assert abs(error.mean()) < 5 * spread / np.sqrt(FLAT.size)
-    assert error.std() == pytest.approx(spread, rel=0.02)
-    for count, share in ((1, 0.683), (2, 0.954), (3, 0.9973)):
-        assert (np.abs(error) < count * sigma).mean() == pytest.approx(share, abs=0.06)
-
-
-def test_noise_is_independent_between_pixels() -> None:
-    error = render_depth(FLAT, sigma=0.02)[0] - 1.0
-    for other in (np.roll(error, 1, 0), np.roll(error, 1, 1)):
-        assert abs(np.corrcoef(error.ravel(), other.ravel())[0, 1]) < 0.02
-
-
-@pytest.mark.parametrize("encoding", ["uint16", "uint8"])
-def test_no_noise_leaves_only_the_encodings_rounding(encoding: str) -> None:
-    depth = np.linspace(0.4, 2.0, 900, dtype=np.float32).reshape(1, 30, 30)
-    step = 0.001 if encoding == "uint16" else 1.6 / 255
-    error = render_depth(depth, encoding, sigma=0.0) - depth
-    assert 0.4 * step < np.abs(error).max() <= 0.501 * step
-
-
-@pytest.mark.parametrize("encoding", ["uint16", "uint8"])
-def test_values_are_clamped_after_the_noise(encoding: str) -> None:
-    depth = np.array([[[0.1, 0.4, 2.0, 5.0, np.inf]]], np.float32).repeat(500, axis=1)
-    sensed = render_depth(depth, encoding, sigma=0.01)[0]
-    assert sensed.min() == pytest.approx(0.4)
-    assert sensed.max() == pytest.approx(2.0)
-    np.testing.assert_allclose(sensed[:, 0], 0.4)
-    np.testing.assert_allclose(sensed[:, 3:], 2.0)
-    assert (sensed[:, 1] > 0.4).any()
-    assert (sensed[:, 2] < 2.0).any()
-
-
-def test_noise_depends_on_its_seed_alone() -> None:
-    space = DepthImage(20, 20)
-    depth, sigma = np.full((3, 20, 20), 1.0, np.float32), np.full(3, 0.01)
-    many = sense_depth(depth, space, sigma, np.array([5, 6, 5], np.uint64))
-    np.testing.assert_array_equal(many[0], many[2])
-    assert (many[0] != many[1]).mean() > 0.8
-    alone = sense_depth(depth[:1], space, sigma[:1], np.array([6], np.uint64))
-    np.testing.assert_array_equal(alone[0], many[1])
-
-
-def test_every_picture_has_its_own_sigma() -> None:
-    space = DepthImage(100, 100)
-    depth = np.full((3, 100, 100), 1.0, np.float32)
-    seeds = np.array([1, 2, 3], np.uint64)
-    sensed = sense_depth(depth, space, np.array([0.0, 0.01, 0.05]), seeds)
-    assert sensed.std(axis=(1, 2, 3)) == pytest.approx([0.0, 10.0, 50.0], rel=0.03)
-
-
-def test_true_depth_is_left_alone() -> None:
-    depth = FLAT.copy()
-    render_depth(depth)
-    np.testing.assert_array_equal(depth, FLAT)

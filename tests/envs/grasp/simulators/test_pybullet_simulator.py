@@ -14,7 +14,8 @@ from worlds import FIRST, fixed_views, home, pose, reaching, sampled
 
 from encoders.spaces import DepthImage
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import CameraPoses, focal_length_px, sample_views, sense_depth
+from envs.grasp.sensors.camera import CameraPoses, focal_length_px, sample_views
+from envs.grasp.sensors.depth import sense_depth
 from envs.grasp.settings import Camera, GraspSettings, Support, Workspace
 from envs.grasp.simulators import pybullet as pybullet_module
 from envs.grasp.simulators.factory import make_simulator
@@ -173,7 +174,7 @@ def test_sense_is_the_rendered_depth_with_the_sensors_model(
     seeds = np.array([7, 8], np.uint64)
     raw = simulator.render_depth(np.arange(2), views["depth"], space, seeds)
     depth = simulator.render(np.arange(2), views["depth"])
-    np.testing.assert_array_equal(raw, sense_depth(depth, space, np.full(2, 0.002), seeds))
+    np.testing.assert_array_equal(raw, sense_depth(depth, views["depth"], space, seeds))
     error = raw[..., 0] - 1000 * depth
     seen = np.isfinite(depth) & (depth > 0.5) & (depth < 1.9)
     assert error[seen].std() == pytest.approx(2.0, rel=0.1)

@@ -1,4 +1,4 @@
-"""Gaussian noise from a counter: number i of a seed depends on nothing but i and the seed.
+"""Noise from a counter: number i of a seed depends on nothing but i and the seed.
 
 Loops without a branch, which a compiler turns into vectors: hence polynomials where a library's
 logarithm, sine and cosine would be called once for each number.
@@ -13,6 +13,8 @@ from envs.grasp.simulators.kernels.worlds import kernel
 from envs.grasp.threefry import threefry
 
 FAST = {"contract", "reassoc", "nsz", "arcp", "afn"}
+# The second words of the counters, so that no two kinds of numbers have the same bits.
+NORMALS, UNIFORMS = np.uint32(0), np.uint32(1)
 MANTISSA_BITS = np.int32(23)
 # Of the float32 next to sqrt(1/2): mantissas go from there to sqrt(2).
 HALF_ROOT_BITS = np.int32(0x3F3504F3)
@@ -59,7 +61,7 @@ def fill_normals(seed: np.uint64, out: NDArray[np.float32]) -> None:
     half = np.uint32(len(out) // 2)
     key = (np.uint32(seed), np.uint32(seed >> np.uint64(32)))
     for i in range(half):
-        bits, turn = threefry(key, (np.uint32(i), np.uint32(0)))
+        bits, turn = threefry(key, (np.uint32(i), NORMALS))
         radius = np.sqrt(np.float32(2.0) * max(_minus_log(bits), np.float32(0.0)))
         # Two bits choose the quarter of the circle, the others the angle in it, +-1/8 turn.
         angle = np.float32(np.int32(np.uint32(turn << np.uint32(2)))) * np.float32(2.0**-32)
@@ -75,3 +77,19 @@ def fill_normals(seed: np.uint64, out: NDArray[np.float32]) -> None:
         )
         out[i] = radius * sign * (sine if swapped else cosine)
         out[half + i] = radius * sign * (cosine if swapped else sine)
+
+
+@kernel(fastmath=FAST)
+def fill_uniforms(seed: np.uint64, out: NDArray[np.float32]) -> None:
+    """Fills an array of even length with numbers uniform in [0, 1), multiples of 2^-24.
+
+    Args:
+        seed: uint64, of which every one gives other numbers.
+        out: (2 k,) whose halves are the two numbers of each pair.
+    """
+    half = np.uint32(len(out) // 2)
+    key = (np.uint32(seed), np.uint32(seed >> np.uint64(32)))
+    for i in range(half):
+        first, second = threefry(key, (np.uint32(i), UNIFORMS))
+        out[i] = np.float32(np.int32(first >> np.uint32(8))) * np.float32(2.0**-24)
+        out[half + i] = np.float32(np.int32(second >> np.uint32(8))) * np.float32(2.0**-24)

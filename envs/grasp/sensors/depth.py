@@ -1,0 +1,142 @@
+"""The depth sensor's model: from true depth to the raw image, in both simulators the same numbers.
+
+True depth -> Gaussian noise -> what is outside the range or missing becomes "nothing seen" ->
+encoding. What is random in a picture comes from its seed alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from encoders.spaces import NOTHING_SEEN, DepthImage
+from envs.grasp.sensors.camera import CameraPoses
+from envs.grasp.sensors.noise import FAST, fill_normals, fill_uniforms
+from envs.grasp.simulators.kernels.worlds import kernel
+
+Floats = NDArray[np.float64]
+Pixels = NDArray[np.float32]
+Codes = NDArray[np.uint16]
+
+
+class Sensor(NamedTuple):
+    """The depth sensor of n pictures, with what `DepthImage.encode` does in numbers.
+
+    Attributes:
+        seeds: (n,) uint64 of all that is random in each picture.
+        sigma_m: (n,) of the noise.
+        missing: (n,) probability of each pixel to be missing.
+        min_m, max_m: ends of the range.
+        zero_m, codes_per_m: code = (depth - zero_m) * codes_per_m.
+        first, last: codes of the ends.
+    """
+
+    seeds: NDArray[np.uint64]
+    sigma_m: Floats
+    missing: Floats
+    min_m: float
+    max_m: float
+    zero_m: float
+    codes_per_m: float
+    first: int
+    last: int
+
+
+def sensor_of(views: CameraPoses, space: DepthImage, seeds: NDArray[np.uint64]) -> Sensor:
+    """The sensor of n depth cameras whose raw images belong to a space.
+
+    Args:
+        views: the cameras.
+        space: range and encoding.
+        seeds: (n,) of the pictures.
+
+    Raises:
+        ValueError: a camera's noise or share of missing pixels is not finite, or not of shape (n,).
+    """
+    for name in ("noise_sigma_m", "missing_fraction"):
+        values = getattr(views, name)
+        if np.shape(values) != np.shape(seeds) or not np.isfinite(values).all():
+            raise ValueError(f"{name} must be finite, one for each of {len(seeds)} pictures")
+    return Sensor(
+        np.ascontiguousarray(seeds, np.uint64),
+        np.ascontiguousarray(views.noise_sigma_m, np.float64),
+        np.ascontiguousarray(views.missing_fraction, np.float64),
+        *space.range_m,
+        space.zero_m,
+        space.codes_per_m,
+        *space.codes,
+    )
+
+
+def sense_depth(
+    depth_m: Pixels, views: CameraPoses, space: DepthImage, seeds: NDArray[np.uint64]
+) -> NDArray[Any]:
+    """Raw images (n, H, W, 1), in the space's type, of true depths.
+
+    Args:
+        depth_m: (n, H, W), infinite where nothing is hit.
+        views: the cameras, with their noise.
+        space: range and encoding.
+        seeds: (n,) of all that is random, one for each picture, so that it does not matter which
+            process takes the picture, or when.
+    """
+    codes = np.empty(depth_m.shape, np.uint16)
+    rows = np.ascontiguousarray(depth_m, np.float32).reshape(len(depth_m), -1)
+    _sense_rows(rows, sensor_of(views, space, seeds), codes.reshape(rows.shape))
+    return codes[..., None].astype(space.dtype, copy=False)
+
+
+@kernel()
+def _sense_rows(depths: Pixels, sensor: Sensor, codes: Codes) -> None:
+    normals, uniforms = scratch(depths.shape[1])
+    for row in range(len(depths)):
+        sense(depths[row], False, sensor, row, normals, uniforms, codes[row])
+
+
+@kernel()
+def scratch(pixels: int) -> tuple[Pixels, Pixels]:
+    """Room for the random numbers of one picture, for `sense`."""
+    even = (pixels + 1) // 2 * 2
+    return np.zeros(even, np.float32), np.zeros(even, np.float32)
+
+
+@kernel(fastmath=FAST)
+def sense(
+    true: Pixels,
+    inverse: bool,
+    sensor: Sensor,
+    row: int,
+    normals: Pixels,
+    uniforms: Pixels,
+    codes: Codes,
+) -> None:
+    """Writes the codes (P,) of one picture.
+
+    Args:
+        true: (P,) true depth in metres, infinite where nothing is hit; or one over it.
+        inverse: which of the two. A renderer has the inverse, and its division costs nothing here.
+        sensor: of n pictures.
+        row: which of them this is.
+        normals: (P or P + 1,) from `scratch`.
+        uniforms: the same.
+        codes: (P,) written.
+    """
+    if sensor.sigma_m[row] > 0.0:
+        fill_normals(sensor.seeds[row], normals)
+    # Where it is 0, it multiplies what an earlier picture left in the scratch.
+    sigma = np.float32(sensor.sigma_m[row])
+    low, high = np.float32(sensor.min_m), np.float32(sensor.max_m)
+    zero, scale = np.float32(sensor.zero_m), np.float32(sensor.codes_per_m)
+    first, last = np.float32(sensor.first), np.float32(sensor.last)
+    for pixel in range(len(codes)):
+        depth = np.float32(1.0) / true[pixel] if inverse else true[pixel]
+        measured = depth + sigma * normals[pixel]
+        code = np.int32(min(max(np.rint((measured - zero) * scale), first), last))
+        codes[pixel] = code if (measured >= low) & (measured <= high) else NOTHING_SEEN
+    missing = np.float32(sensor.missing[row])
+    if missing > 0.0:
+        fill_uniforms(sensor.seeds[row], uniforms)
+        for pixel in range(len(codes)):
+            codes[pixel] = NOTHING_SEEN if uniforms[pixel] < missing else codes[pixel]
