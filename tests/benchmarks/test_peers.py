@@ -168,8 +168,9 @@ def test_both_networks_compute_the_same(size: int) -> None:
         _copy(theirs.features_extractor, [policy.actor.frame_encoders, policy.actor.trunk])
         _copy(theirs.action_net, [policy.action_head])
         _copy(theirs.value_net, [policy.value_head])
+        # Without 0, which is "nothing seen" here, and the nearest depth there.
         images = torch.from_numpy(
-            np.random.default_rng(0).integers(0, 256, (3, size, size, 1), np.uint8)
+            np.random.default_rng(0).integers(1, 256, (3, size, size, 1), np.uint8)
         )
         with torch.no_grad():
             distribution, values = policy(Observations({"depth": images}, {}))
