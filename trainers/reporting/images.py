@@ -18,23 +18,23 @@ class Pictured(Protocol):
     """A space of images that knows how people should see them."""
 
     def picture(self, frame: NDArray[Any]) -> NDArray[np.uint8]:
-        """One observation (H, W, C) as RGB (H, W, 3)."""
+        """One observation (H, W, C) as colors (H, W, 3)."""
 
 
 def picture(space: gymnasium.Space[Any], frame: NDArray[Any]) -> NDArray[np.uint8]:
-    """RGB (h, w, 3) of an image observation (H, W, C), enlarged to be seen.
+    """Colors (h, w, 3) of an image observation (H, W, C), enlarged to be seen.
 
     A space with a method `picture` draws it. Of others the first three channels are the colors, or
     the first one is the gray: bytes, or floats in [0, 1].
     """
-    rgb = space.picture(frame) if isinstance(space, Pictured) else _channels(frame)
-    factor = max(1, -(-MIN_SIDE_PX // min(rgb.shape[:2])))
-    enlarged = cv2.resize(rgb, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
+    colors = space.picture(frame) if isinstance(space, Pictured) else _channels(frame)
+    factor = max(1, -(-MIN_SIDE_PX // min(colors.shape[:2])))
+    enlarged = cv2.resize(colors, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
     return np.asarray(enlarged, np.uint8)
 
 
 def _channels(frame: NDArray[Any]) -> NDArray[np.uint8]:
-    rgb = frame[..., :3] if frame.shape[-1] >= 3 else np.repeat(frame[..., :1], 3, axis=-1)
-    if np.issubdtype(rgb.dtype, np.floating):
-        rgb = np.rint(rgb.clip(0.0, 1.0) * BYTE_MAX)
-    return rgb.astype(np.uint8)
+    colors = frame[..., :3] if frame.shape[-1] >= 3 else np.repeat(frame[..., :1], 3, axis=-1)
+    if np.issubdtype(colors.dtype, np.floating):
+        colors = np.rint(colors.clip(0.0, 1.0) * BYTE_MAX)
+    return colors.astype(np.uint8)
