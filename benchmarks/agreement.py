@@ -20,13 +20,14 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.tables import table
+from envs.grasp.robot.arm import Arm
+from envs.grasp.robot.urdf import Robot, load_robot
 from envs.grasp.scene.sampler import Scenes, SceneSampler
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Camera, GraspSettings, Support
 from envs.grasp.simulators.base import Contacts, Simulator
 from envs.grasp.simulators.fast import FastSimulator
 from envs.grasp.simulators.pybullet import PyBulletSimulator
-from envs.grasp.task import Arm
 
 DEPTH_TOLERANCE_M = 0.001
 COLOR_TOLERANCE = 2
@@ -43,8 +44,11 @@ FIGURES = {
 }
 """What each figure of `Agreement` is, and how much of it there must be."""
 
+ROBOT = load_robot()
+
 Images = NDArray[Any]
 Flags = NDArray[np.bool_]
+MakeSimulator = Callable[[int, Robot, Support], Simulator]
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,7 @@ class Sample:
         limits = np.full(scenes, np.pi)
         self.scenes, self.views = SceneSampler(settings).sample(self.rng, limits)
         self.everywhere = np.arange(scenes)
-        self._arm = Arm(settings.workspace, settings.motion_checks)
+        self._arm = Arm(ROBOT, settings.workspace, settings.motion_checks)
         self.start = self._arm.home(scenes)
         self._advance()  # the home pose is out of the camera's sight
 
@@ -154,9 +158,9 @@ def compare(
     return found, (exact[0], fast[0])
 
 
-def photographs(make: Callable[[int, Support], Simulator], sample: Sample) -> tuple[Images, Images]:
+def photographs(make: MakeSimulator, sample: Sample) -> tuple[Images, Images]:
     """Depth (n, H, W) and color (n, H, W, 3) of the scenes, with the robots in view."""
-    simulator = make(len(sample.scenes), Support())
+    simulator = make(len(sample.scenes), ROBOT, Support())
     try:
         simulator.load(sample.everywhere, sample.scenes, sample.start.joints_rad)
         depth = simulator.render(sample.everywhere, sample.views["depth"])
@@ -211,7 +215,7 @@ def compare_contacts(
 
 
 def contacts(
-    make: Callable[[int, Support], Simulator],
+    make: MakeSimulator,
     sample: Sample,
     paths: list[NDArray[np.float64]],
     grow_m: float,
@@ -224,7 +228,7 @@ def contacts(
         top_m=support.top_m + grow_m,
         thickness_m=support.thickness_m + 2.0 * grow_m,
     )
-    simulator = make(len(sample.scenes), support)
+    simulator = make(len(sample.scenes), ROBOT, support)
     try:
         simulator.load(sample.everywhere, grown(sample.scenes, grow_m), paths[0][:, 0])
         found: list[Contacts] = [simulator.move(sample.everywhere, path) for path in paths]

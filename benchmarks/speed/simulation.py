@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.agreement import Sample
+from benchmarks.agreement import ROBOT, Sample
 from benchmarks.speed.figures import FAST, MODES, PYBULLET, Figures, race, rate
 from encoders.spaces import DepthImage
 from envs.grasp.env import built_in_rewards, make_vector_env
@@ -95,7 +95,7 @@ class _Worlds:
         settings = GraspSettings.model_validate(
             {"simulator": simulator, "num_envs": num_worlds, "cameras": {kind: camera}}
         )
-        self.simulator = make_simulator(settings, num_worlds)
+        self.simulator = make_simulator(settings, ROBOT, num_worlds)
         self._sample = Sample(num_worlds, (size, size))
         self._views = self._sample.views[kind]
         space = observation_space(settings)[kind]

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.grasp.robot.arm import Tools
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Camera
-from envs.grasp.task import EpisodeProgress, GoalRegion, Tools
+from envs.grasp.task import EpisodeProgress, GoalRegion
 
 BATCHES = {"scenes": Scenes, "region": GoalRegion, "tools": Tools, "progress": EpisodeProgress}
 

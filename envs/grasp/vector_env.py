@@ -21,11 +21,13 @@ from envs.grasp.episode_state import RunningEpisodes
 from envs.grasp.evaluation.evaluator import EVALUATION_OPTIONS, GraspEvaluator
 from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.observations import PRIVILEGED, observation_space, privileged_state
+from envs.grasp.robot.arm import Arm
+from envs.grasp.robot.urdf import load_robot
 from envs.grasp.scene.sampler import Scenes, SceneSampler
 from envs.grasp.sensors.camera import CameraPoses, overviews
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.factory import make_simulator
-from envs.grasp.task import Arm, EpisodeProgress, GoalRegion, Motion, advance, goal_middle_m, judge
+from envs.grasp.task import EpisodeProgress, GoalRegion, Motion, advance, goal_middle_m, judge
 from rewards.grasp.transition import GraspTransition
 from rewards.reward import RewardTerm, fitting, weigh
 
@@ -77,12 +79,15 @@ class GraspVectorEnv(Environment):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._parameters: dict[str, ParameterValue] = {}
-        self._arm = Arm(settings.workspace, settings.motion_checks)
+        self._robot = load_robot()
+        self._arm = Arm(self._robot, settings.workspace, settings.motion_checks)
         self._sampler = SceneSampler(settings)
         self._everyone = np.arange(self.num_envs)
         self._episodes: RunningEpisodes | None = None
         self._rng = np.random.default_rng(seed)
-        self._simulator = make_simulator(settings, self.num_envs, render_mode == "human")
+        self._simulator = make_simulator(
+            settings, self._robot, self.num_envs, render_mode == "human"
+        )
 
     # -- gymnasium's interface -------------------------------------------------------------------
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from envs.grasp.robot.kinematics import InverseKinematics
-from envs.grasp.robot.urdf import HOME_JOINTS_RAD, load_robot
+from envs.grasp.robot.urdf import load_robot
 from envs.grasp.scene.sampler import Scenes, SceneSampler
 from envs.grasp.sensors.camera import CameraPoses, sample_views
 from envs.grasp.settings import Camera, GraspSettings
 
 ROBOT = load_robot()
 INVERSE = InverseKinematics(ROBOT)
-HOME = np.array(HOME_JOINTS_RAD)
+HOME = ROBOT.home_rad
 FIRST = np.array([0])
 
 

@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from envs.grasp.evaluation.pick import STEP_S, Attempt, Picker
 from envs.grasp.evaluation.pose_errors import Sample
+from envs.grasp.robot.urdf import load_robot
 from envs.grasp.sensors.camera import overviews
 from envs.grasp.settings import Pick, Support
 
@@ -40,7 +41,7 @@ def film(shots: Sequence[Sample], support: Support, settings: Pick, pick: bool) 
     """
     frames: list[Image.Image] = []
     durations: list[int] = []
-    picker = Picker(support, settings)
+    picker = Picker(load_robot(), support, settings)
     try:
         for number, shot in enumerate(shots, 1):
             captured = _Camera(f"{number} of {len(shots)}   {shot.caption}")

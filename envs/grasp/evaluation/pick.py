@@ -23,7 +23,7 @@ from envs.grasp.robot.kinematics import (
     motion_duration_s,
     tooltip_pose,
 )
-from envs.grasp.robot.urdf import HOME_JOINTS_RAD, load_robot
+from envs.grasp.robot.urdf import Robot
 from envs.grasp.scene.sampler import Scenes, to_world
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Pick, Support
@@ -44,7 +44,6 @@ from envs.grasp.simulators.bodies import (
 from envs.grasp.simulators.colors import BLOCK_RGBA
 from envs.grasp.simulators.pybullet import projection_matrices, view_matrices
 
-CUP_RADIUS_M = 0.03
 RIM_POINTS = 72
 STEP_S = 1.0 / 240.0
 GRAVITY_M_S2 = 9.81
@@ -91,6 +90,7 @@ class Picker:
     """Carries out picks, one after the other. They are deterministic, whatever came before them.
 
     Args:
+        robot: picks.
         support: the table.
         settings: masses, frictions, forces and ways.
         window: show the picks in PyBullet's window, as fast as they would go.
@@ -99,8 +99,9 @@ class Picker:
         ValueError: a window is asked for where none can be opened.
     """
 
-    def __init__(self, support: Support, settings: Pick, window: bool = False):
-        self._support, self._settings, self._window = support, settings, window
+    def __init__(self, robot: Robot, support: Support, settings: Pick, window: bool = False):
+        self._robot, self._support, self._settings = robot, support, settings
+        self._window = window
         self._client = open_client(window)
 
     def pick(
@@ -140,7 +141,7 @@ class Picker:
             time.sleep(STEP_S)
 
         shown = at_its_pace if self._window else watch
-        return Attempt(self._client, self._support, self._settings, scene, shown)
+        return Attempt(self._client, self._robot, self._support, self._settings, scene, shown)
 
 
 class PickCheck:
@@ -177,6 +178,7 @@ class Attempt:
 
     Args:
         client: PyBullet's; what it holds is removed.
+        robot: picks.
         support: the table.
         settings: masses, frictions, forces and ways.
         scene: one row.
@@ -184,18 +186,24 @@ class Attempt:
     """
 
     def __init__(
-        self, client: int, support: Support, settings: Pick, scene: Scenes, watch: Watch = unwatched
+        self,
+        client: int,
+        robot: Robot,
+        support: Support,
+        settings: Pick,
+        scene: Scenes,
+        watch: Watch = unwatched,
     ):
         self._id, self._settings, self._scene, self._watch = client, settings, scene, watch
-        self._kinematics = load_robot()
+        self._kinematics = robot
         self._inverse = InverseKinematics(self._kinematics)
         # Nothing that a solver remembers of an earlier pick can change this one.
         pybullet.resetSimulation(physicsClientId=client)
         pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)
         pybullet.setTimeStep(STEP_S, physicsClientId=client)
         pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
-        self._robot = add_robot(client)
-        self._joints_rad = np.array(HOME_JOINTS_RAD)
+        self._robot = add_robot(client, robot)
+        self._joints_rad = robot.home_rad
         set_joints(client, self._robot, self._joints_rad)
         table = add_support(client, support)
         blocks = [self._add_block(number) for number in range(scene.box_half_m.shape[1])]
@@ -237,7 +245,8 @@ class Attempt:
         tip, axes = _pose(*self._tooltip())
         position, rotation = _pose(*self.target_pose())
         angle = np.arange(RIM_POINTS)[:, None] * (2.0 * math.pi / RIM_POINTS)
-        rim = tip + CUP_RADIUS_M * (np.cos(angle) * axes[:, 0] + np.sin(angle) * axes[:, 1])
+        around = np.cos(angle) * axes[:, 0] + np.sin(angle) * axes[:, 1]
+        rim = tip + self._kinematics.cup_radius_m * around
         # In the block's own frame the face is the plane x = 0, a rectangle for each of its boxes.
         local = (rim - position) @ rotation + _center_of_mass(self._scene, 0)
         center, half = block_boxes(self._scene, 0)
@@ -340,7 +349,8 @@ class Attempt:
         times area, in every direction; its moments are not limited.
         """
         settings = self._settings
-        force_n = settings.cup_friction * settings.vacuum_pa * math.pi * CUP_RADIUS_M**2
+        area_m2 = math.pi * self._kinematics.cup_radius_m**2
+        force_n = settings.cup_friction * settings.vacuum_pa * area_m2
         tooltip = self._tooltip()
         cup = pybullet.getLinkState(self._robot.body, self._robot.cup, physicsClientId=self._id)[:2]
         on_cup = pybullet.multiplyTransforms(*pybullet.invertTransform(*cup), *tooltip)

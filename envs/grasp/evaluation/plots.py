@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from encoders.spaces import NOTHING_SEEN
-from envs.grasp.evaluation.pick import CUP_RADIUS_M, Outcome
+from envs.grasp.evaluation.pick import Outcome
 from envs.grasp.evaluation.pose_errors import PoseErrors, Sample, outcome_label
+from envs.grasp.robot.urdf import load_robot
 from envs.grasp.scene.sampler import heading
 from envs.grasp.sensors.camera import project
 from envs.grasp.settings import Goal
@@ -153,7 +154,8 @@ def _draw_cup(axes: Axes, shot: Sample, tooltip_m: Floats, yaw_rad: float, color
     """Draws the cup's rim, and its axis back towards the robot."""
     angle = np.linspace(0.0, 2.0 * math.pi, RIM_POINTS)[:, None]
     ahead, up = heading(np.array(yaw_rad)), np.array([0.0, 0.0, 1.0])
-    rim = tooltip_m + CUP_RADIUS_M * (np.cos(angle) * np.cross(up, ahead) + np.sin(angle) * up)
+    radius_m = load_robot().cup_radius_m
+    rim = tooltip_m + radius_m * (np.cos(angle) * np.cross(up, ahead) + np.sin(angle) * up)
     stem = np.stack([tooltip_m, tooltip_m - STEM_M * ahead])
     for points in (rim, stem):
         u, v, _ = project(shot.view, points[None])[0].T

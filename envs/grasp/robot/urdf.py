@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +10,7 @@ import numpy as np
 
 KR16_URDF = Path(__file__).with_name("kr16.urdf")
 
-# Arm retracted upward, tool pointing up: the blocks' region is free, the camera's view is open, and
-# A5 is negative as at every grasp pose, so that no motion from here has to flip the wrist.
-HOME_JOINTS_RAD = tuple(math.radians(angle) for angle in (0.0, -110.0, 100.0, 0.0, -60.0, 0.0))
-
-_TOOLTIP = "tooltip"
+_TOOLTIP, _CUP, _HOME = "tooltip", "cup", "home"
 _LIMIT_KEYS = ("lower", "upper", "velocity")
 
 
@@ -50,6 +45,8 @@ class Robot:
         lower_rad: (J,) lower joint limits.
         upper_rad: (J,) upper joint limits.
         max_speed_rad_s: (J,) largest joint speeds.
+        home_rad: (J,) where the robot waits: the file's <group_state name="home">, as SRDF writes
+            it; zeros where it has none.
         link_names: The L links.
         link_parents: For each link the index of its parent; -1 for the base.
         link_joints: For each link the index of the joint that moves it; -1 where it is fixed.
@@ -65,6 +62,7 @@ class Robot:
     lower_rad: np.ndarray
     upper_rad: np.ndarray
     max_speed_rad_s: np.ndarray
+    home_rad: np.ndarray
     link_names: tuple[str, ...]
     link_parents: tuple[int, ...]
     link_joints: tuple[int, ...]
@@ -76,6 +74,18 @@ class Robot:
     def tooltip_link(self) -> int:
         """Index of the tooltip's frame among the links."""
         return self.link_names.index(_TOOLTIP)
+
+    @property
+    def cup_link(self) -> int:
+        """Index of the suction cup among the links; the cup is its only shape, a cylinder."""
+        return self.link_names.index(_CUP)
+
+    @property
+    def cup_radius_m(self) -> float:
+        """Radius of the cup's face."""
+        (cup,) = self.link_primitives[self.cup_link]
+        assert isinstance(cup, Cylinder)
+        return cup.radius_m
 
     @property
     def tooltip(self) -> np.ndarray:
@@ -118,13 +128,15 @@ def load_robot(path: str | Path = KR16_URDF) -> Robot:
     moving = [name for name in order if name in joints and _moves(joints[name], path)]
     limits = np.array([_limit(joints[name], path) for name in moving]).reshape(-1, 3)
     axes = np.array([_axis(joints[name], path) for name in moving]).reshape(-1, 3)
+    joint_names = tuple(_attribute(joints[name], "name", str(path)) for name in moving)
     return Robot(
         path=path,
-        joint_names=tuple(_attribute(joints[name], "name", str(path)) for name in moving),
+        joint_names=joint_names,
         joint_axes=axes,
         lower_rad=limits[:, 0],
         upper_rad=limits[:, 1],
         max_speed_rad_s=limits[:, 2],
+        home_rad=_home(root, joint_names, path),
         link_names=tuple(order),
         link_parents=tuple(
             order.index(_end(joints[name], path)[0]) if name in joints else -1 for name in order
@@ -178,6 +190,17 @@ def _limit(joint: ET.Element, path: Path) -> list[float]:
     where = f"{path}: joint '{joint.get('name')}'"
     limit = _child(joint, "limit", where)
     return [_numbers(_attribute(limit, key, where), 1, where)[0] for key in _LIMIT_KEYS]
+
+
+def _home(root: ET.Element, joint_names: tuple[str, ...], path: Path) -> np.ndarray:
+    """(J,) the joint angles of the state called home; zeros where there is none."""
+    where, home = f"{path}: group_state '{_HOME}'", np.zeros(len(joint_names))
+    for joint in root.iterfind(f"group_state[@name='{_HOME}']/joint"):
+        name = _attribute(joint, "name", where)
+        if name not in joint_names:
+            raise ValueError(f"{where}: no moving joint is called '{name}'")
+        (home[joint_names.index(name)],) = _numbers(_attribute(joint, "value", where), 1, where)
+    return home
 
 
 def _axis(joint: ET.Element, path: Path) -> np.ndarray:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pybullet
 
-from envs.grasp.robot.urdf import KR16_URDF
+from envs.grasp.robot.urdf import Robot
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.base import Floats, Images
@@ -51,10 +51,10 @@ def close_client(client: int) -> None:
         pybullet.disconnect(client)
 
 
-def add_robot(client: int) -> RobotBody:
-    """Adds the robot, its base fixed to the world's origin."""
+def add_robot(client: int, robot: Robot) -> RobotBody:
+    """Adds a robot, its base fixed to the world's origin."""
     body = pybullet.loadURDF(
-        str(KR16_URDF),
+        str(robot.path),
         useFixedBase=True,
         flags=pybullet.URDF_USE_IMPLICIT_CYLINDER,  # a hull would dent the cup's rim
         physicsClientId=client,
@@ -65,7 +65,8 @@ def add_robot(client: int) -> RobotBody:
     ]
     links = {info[12].decode(): info[0] for info in infos}
     joints = [info[0] for info in infos if info[2] == pybullet.JOINT_REVOLUTE]
-    return RobotBody(body, joints, links["cup"], links["tooltip"])
+    cup, tooltip = (links[robot.link_names[link]] for link in (robot.cup_link, robot.tooltip_link))
+    return RobotBody(body, joints, cup, tooltip)
 
 
 def set_joints(client: int, robot: RobotBody, joints_rad: Floats) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+from envs.grasp.robot.urdf import Robot
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.base import Simulator
 from envs.grasp.simulators.fast import FastSimulator
@@ -14,27 +15,29 @@ from envs.grasp.simulators.workers import ParallelSimulator
 MIN_WORLDS_PER_WORKER = 4
 
 
-def make_simulator(settings: GraspSettings, num_worlds: int, window: bool = False) -> Simulator:
+def make_simulator(
+    settings: GraspSettings, robot: Robot, num_worlds: int, window: bool = False
+) -> Simulator:
     """Builds the simulator of a run; a window means no worker processes.
 
     Raises:
         ValueError: a window is asked for where there is none.
     """
     if settings.simulator == "fast":
-        return _fast(settings, num_worlds, window)
+        return _fast(settings, robot, num_worlds, window)
     workers = settings.workers
     if workers is None:
         workers = min(len(os.sched_getaffinity(0)), num_worlds // MIN_WORLDS_PER_WORKER)
         workers = workers if workers > 1 else 0
     if window or workers == 0:
-        return PyBulletSimulator(num_worlds, settings.support, window)
-    return ParallelSimulator(num_worlds, min(workers, num_worlds), settings.support)
+        return PyBulletSimulator(num_worlds, robot, settings.support, window)
+    return ParallelSimulator(num_worlds, min(workers, num_worlds), robot, settings.support)
 
 
-def _fast(settings: GraspSettings, num_worlds: int, window: bool) -> FastSimulator:
+def _fast(settings: GraspSettings, robot: Robot, num_worlds: int, window: bool) -> FastSimulator:
     if window:
         raise ValueError(
             "simulator: fast has no window: use simulator: pybullet, or render_mode: rgb_array"
         )
     threads = None if settings.workers is None else max(settings.workers, 1)
-    return FastSimulator(num_worlds, settings.support, threads)
+    return FastSimulator(num_worlds, robot, settings.support, threads)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
-from envs.grasp.robot.urdf import Box, Robot, load_robot
+from envs.grasp.robot.urdf import Box, Robot
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses, focal_length_px
 from envs.grasp.sensors.depth import Sensor, sensor_of
@@ -24,7 +24,6 @@ from envs.grasp.simulators.kernels.pictures import ViewArrays, take_pictures
 from envs.grasp.simulators.kernels.worlds import RobotArrays, WorldArrays
 from envs.grasp.simulators.thread_pool import ThreadPool
 
-CUP = "cup"
 ORTHONORMAL_TOLERANCE = 1e-6
 # Pictures that are not asked for.
 NO_DEPTHS = np.empty((0, 0, 0), np.float32)
@@ -38,6 +37,7 @@ class FastSimulator:
 
     Args:
         num_worlds: N.
+        robot: stands in every one of them.
         support: the table.
         threads: among which the worlds are divided; None: one for each core.
 
@@ -45,9 +45,9 @@ class FastSimulator:
         ValueError: `threads` is less than one.
     """
 
-    def __init__(self, num_worlds: int, support: Support, threads: int | None = None):
+    def __init__(self, num_worlds: int, robot: Robot, support: Support, threads: int | None = None):
         self._threads = ThreadPool(threads)
-        self._robot = robot_arrays(load_robot())
+        self._robot = robot_arrays(robot)
         self._num_worlds, self._support = num_worlds, support
         self._worlds = _empty_worlds(num_worlds, 1, len(self._robot.axes))
         self._loaded = np.zeros(num_worlds, bool)
@@ -222,7 +222,7 @@ def robot_arrays(robot: Robot) -> RobotArrays:
         shape_half=half,
         shape_radius=np.linalg.norm(corner, axis=1),
         is_cylinder=is_cylinder,
-        is_cup=links == robot.link_names.index(CUP),
+        is_cup=links == robot.cup_link,
         shape_colors=_color_levels(robot.link_colors[links]),
     )
 

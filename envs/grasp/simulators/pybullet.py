@@ -11,6 +11,7 @@ import pybullet
 from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
+from envs.grasp.robot.urdf import Robot
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses, focal_length_px
 from envs.grasp.sensors.depth import sense_depth
@@ -45,14 +46,15 @@ class PyBulletSimulator:
 
     Args:
         num_worlds: N.
+        robot: stands in every one of them.
         support: the table.
         window: show the worlds of the first client in PyBullet's window, at a pace to be watched.
     """
 
-    def __init__(self, num_worlds: int, support: Support, window: bool = False):
+    def __init__(self, num_worlds: int, robot: Robot, support: Support, window: bool = False):
         self._worlds_per_client = math.ceil(num_worlds / CLIENTS_PER_PROCESS)
         count = math.ceil(num_worlds / self._worlds_per_client)
-        self._clients = [_Client(support, window and number == 0) for number in range(count)]
+        self._clients = [_Client(robot, support, window and number == 0) for number in range(count)]
 
     def load(self, indices: Indices, scenes: Scenes, joints_rad: Floats) -> None:
         """See `Simulator.load`."""
@@ -116,8 +118,8 @@ class _Client:
     resumed sees what an uninterrupted one sees.
     """
 
-    def __init__(self, support: Support, window: bool):
-        self._support = support
+    def __init__(self, robot: Robot, support: Support, window: bool):
+        self._kinematics, self._support = robot, support
         self._pause_s = WINDOW_POSE_S if window else 0.0
         self._id = open_client(window)
         self._worlds: dict[int, _World] = {}
@@ -171,7 +173,7 @@ class _Client:
     def _build(self) -> None:
         """Puts everything into an empty simulation."""
         self._active = None
-        self._robot = add_robot(self._id)
+        self._robot = add_robot(self._id, self._kinematics)
         self._table = add_support(self._id, self._support)
         for world in self._worlds.values():
             self._add_blocks(world)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
+from envs.grasp.robot.urdf import Robot
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Support
@@ -31,15 +32,16 @@ class ParallelSimulator:
     Args:
         num_worlds: N.
         num_workers: processes, at most N.
+        robot: stands in every world.
         support: the table.
     """
 
-    def __init__(self, num_worlds: int, num_workers: int, support: Support):
+    def __init__(self, num_worlds: int, num_workers: int, robot: Robot, support: Support):
         shares = np.array_split(np.arange(num_worlds), num_workers)
         self._starts = np.array([share[0] for share in shares])
         self._workers = [_Worker(number) for number in range(num_workers)]
         for worker, share in zip(self._workers, shares, strict=True):
-            worker.send((len(share), support))
+            worker.send((len(share), robot, support))
 
     def load(self, indices: Indices, scenes: Scenes, joints_rad: Floats) -> None:
         """See `Simulator.load`."""

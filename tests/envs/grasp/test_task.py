@@ -8,17 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from envs.grasp.robot.arm import Arm, Tools
 from envs.grasp.robot.kinematics import tooltip_pose
-from envs.grasp.robot.urdf import HOME_JOINTS_RAD, load_robot
+from envs.grasp.robot.urdf import load_robot
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.settings import Goal, Workspace
 from envs.grasp.simulators.base import Contacts
 from envs.grasp.task import (
-    Arm,
     EpisodeProgress,
     GoalRegion,
     Motion,
-    Tools,
     advance,
     block_offset,
     judge,
@@ -26,7 +25,7 @@ from envs.grasp.task import (
 )
 
 ROBOT = load_robot()
-ARM = Arm(Workspace(), motion_checks=4)
+ARM = Arm(ROBOT, Workspace(), motion_checks=4)
 unit = st.floats(-1, 1)
 
 
@@ -89,7 +88,7 @@ def test_path_is_evenly_spaced_from_where_the_robot_is() -> None:
 
 def test_home() -> None:
     tools = ARM.home(2)
-    np.testing.assert_array_equal(tools.joints_rad, [HOME_JOINTS_RAD] * 2)
+    np.testing.assert_array_equal(tools.joints_rad, [ROBOT.home_rad] * 2)
     frame = tooltip_pose(ROBOT, tools.joints_rad)
     np.testing.assert_allclose(tools.tooltip_m, frame[:, :3, 3])
     np.testing.assert_allclose(tools.axis, frame[:, :3, 2])

@@ -17,7 +17,7 @@ from envs.grasp.robot.kinematics import (
     motion_duration_s,
     tooltip_pose,
 )
-from envs.grasp.robot.urdf import HOME_JOINTS_RAD, KR16_URDF, load_robot
+from envs.grasp.robot.urdf import KR16_URDF, load_robot
 
 # Tooltip x, y, z (m) and yaw (deg). Nearer than x = 0.81 m, A3 would have to fold beyond 154 deg.
 LOWER = (0.81, -0.45, 0.6, -40.0)
@@ -247,5 +247,5 @@ def test_slowest_joint_sets_the_duration() -> None:
 def test_way_home_does_not_flip_the_wrist() -> None:
     poses = workspace((5, 7, 5, 7)).reshape(-1, 4)
     joints, _ = INVERSE(poses[:, :3], poses[:, 3])
-    sweep = np.rad2deg(np.abs(joints - np.array(HOME_JOINTS_RAD)).max(axis=0))
+    sweep = np.rad2deg(np.abs(joints - ROBOT.home_rad).max(axis=0))
     assert (sweep < 100.0).all()

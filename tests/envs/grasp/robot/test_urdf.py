@@ -8,7 +8,7 @@ import pybullet
 import pytest
 
 from envs.grasp.robot.kinematics import forward
-from envs.grasp.robot.urdf import HOME_JOINTS_RAD, KR16_URDF, Box, Cylinder, Robot, load_robot
+from envs.grasp.robot.urdf import KR16_URDF, Box, Cylinder, Robot, load_robot
 
 # The data sheet, in the link's own frame (m).
 ENVELOPES = {
@@ -96,7 +96,7 @@ def test_cup_has_60_mm_and_ends_at_the_tooltip(robot: Robot) -> None:
 
 
 def test_home_leaves_the_blocks_region_free(robot: Robot) -> None:
-    frames = forward(robot, np.array(HOME_JOINTS_RAD))
+    frames = forward(robot, robot.home_rad)
     for frame, shapes in zip(frames, robot.link_primitives, strict=True):
         for shape in shapes:
             grid = _filled(corners(shape)) @ frame.T
@@ -114,7 +114,8 @@ def _filled(box: np.ndarray) -> np.ndarray:
 
 
 def test_home_is_within_the_limits(robot: Robot) -> None:
-    home = np.array(HOME_JOINTS_RAD)
+    home = robot.home_rad
+    np.testing.assert_allclose(np.degrees(home), [0, -110, 100, 0, -60, 0])
     assert ((home > robot.lower_rad) & (home < robot.upper_rad)).all()
 
 

@@ -34,7 +34,7 @@ ASIDE = ((1.35, -0.38), 0.0, (0.1, 0.15, 0.15))
 
 
 def loaded(scenes: Scenes, threads: int | None = None) -> FastSimulator:
-    simulator = FastSimulator(len(scenes), Support(), threads)
+    simulator = FastSimulator(len(scenes), ROBOT, Support(), threads)
     simulator.load(np.arange(len(scenes)), scenes, home(len(scenes)))
     return simulator
 
@@ -61,7 +61,7 @@ def test_pictures_of_any_size_agree(width: int, height: int) -> None:
     # In a handful of pixels no neighbour tells where an edge is: some of many scenes' are on one.
     count, least = (3, 0.99) if width * height > 100 else (50, 0.8)
     everyone, (scenes, _) = np.arange(count), sampled(count)
-    path, fast, exact = reaching(scenes), loaded(scenes), PyBulletSimulator(count, Support())
+    path, fast, exact = reaching(scenes), loaded(scenes), PyBulletSimulator(count, ROBOT, Support())
     exact.load(everyone, scenes, home(count))
     for simulator in (fast, exact):
         simulator.move(everyone, path)
@@ -97,7 +97,7 @@ def test_what_the_camera_is_in_is_seen_through(
     camera = Camera(
         type="depth", position_m=position, target_m=(1.4, 0.05, 0.68), near_m=(near, near)
     )
-    fast, exact = loaded(scene), PyBulletSimulator(1, Support())
+    fast, exact = loaded(scene), PyBulletSimulator(1, ROBOT, Support())
     exact.load(FIRST, scene, home(1))
     depths = [simulator.render(FIRST, fixed_views(camera)) for simulator in (exact, fast)]
     exact.close()
@@ -452,7 +452,7 @@ def test_a_thousand_worlds() -> None:
 def test_worlds_are_loaded_one_by_one_with_any_number_of_blocks(box_scene: SceneBuilder) -> None:
     one = box_scene([((1.1, 0.0), 0.0, (0.1, 0.2, 0.2))])
     two = box_scene([((1.1, 0.1), 0.2, (0.1, 0.2, 0.2)), ASIDE])
-    simulator, views = FastSimulator(3, Support()), fixed_views(Camera(type="depth"))
+    simulator, views = FastSimulator(3, ROBOT, Support()), fixed_views(Camera(type="depth"))
     simulator.load(np.array([2]), one, home(1))
     simulator.load(np.array([0]), two, home(1))  # makes room for more boxes
     simulator.load(np.array([1]), two, home(1))
@@ -511,12 +511,12 @@ def test_bad_input_is_refused_with_its_name() -> None:
     for wrong in ([0, 2], [1, 0], [0, 0], [-1, 0]):
         with pytest.raises(ValueError, match="indices must rise"):
             simulator.move(np.array(wrong), path)
-    fresh = FastSimulator(2, Support())
+    fresh = FastSimulator(2, ROBOT, Support())
     fresh.load(FIRST, scenes[:1], home(1))
     with pytest.raises(ValueError, match=r"worlds \[1\] hold no scene"):
         fresh.move(both, path)
     with pytest.raises(ValueError, match="0 threads"):
-        FastSimulator(2, Support(), threads=0)
+        FastSimulator(2, ROBOT, Support(), threads=0)
 
 
 # -- in the environment ----------------------------------------------------------------------------
@@ -524,10 +524,10 @@ def test_bad_input_is_refused_with_its_name() -> None:
 
 def test_the_factory_builds_it() -> None:
     settings = GraspSettings(simulator="fast", num_envs=3)
-    assert isinstance(make_simulator(settings, 3), FastSimulator)
-    assert isinstance(make_simulator(GraspSettings(workers=0), 1), PyBulletSimulator)
+    assert isinstance(make_simulator(settings, ROBOT, 3), FastSimulator)
+    assert isinstance(make_simulator(GraspSettings(workers=0), ROBOT, 1), PyBulletSimulator)
     with pytest.raises(ValueError, match="rgb_array"):
-        make_simulator(settings, 3, window=True)
+        make_simulator(settings, ROBOT, 3, window=True)
 
 
 def test_an_environment_pays_what_pybullets_does() -> None:
@@ -565,13 +565,14 @@ def test_a_second_start_compiles_nothing() -> None:
     loaded(sampled(1)[0]).move(FIRST, pose(1.0, 0.0, 0.8))
     code = (
         "import numpy as np\n"
-        "from envs.grasp.robot.urdf import HOME_JOINTS_RAD\n"
+        "from envs.grasp.robot.urdf import load_robot\n"
         "from envs.grasp.scene.sampler import SceneSampler\n"
         "from envs.grasp.settings import GraspSettings, Support\n"
         "from envs.grasp.simulators.fast import FastSimulator\n"
         "from envs.grasp.simulators.kernels.contacts import touch_along\n"
         "scenes, _ = SceneSampler(GraspSettings()).sample(np.random.default_rng(0), np.ones(1))\n"
-        "simulator, home = FastSimulator(1, Support()), np.array([HOME_JOINTS_RAD])\n"
+        "robot = load_robot()\n"
+        "simulator, home = FastSimulator(1, robot, Support()), robot.home_rad[None]\n"
         "simulator.load(np.array([0]), scenes, home)\n"
         "simulator.move(np.array([0]), home[:, None])\n"
         "print(sum(touch_along.stats.cache_misses.values()))\n"

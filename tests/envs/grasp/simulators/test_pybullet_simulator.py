@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pybullet
 import pytest
-from worlds import FIRST, fixed_views, home, pose, reaching, sampled
+from worlds import FIRST, ROBOT, fixed_views, home, pose, reaching, sampled
 
 from encoders.spaces import DepthImage
+from envs.grasp.robot.arm import Arm, Tools
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses, focal_length_px, sample_views
 from envs.grasp.sensors.depth import sense_depth
@@ -21,7 +22,6 @@ from envs.grasp.simulators import pybullet as pybullet_module
 from envs.grasp.simulators.factory import make_simulator
 from envs.grasp.simulators.pybullet import PyBulletSimulator
 from envs.grasp.simulators.workers import ParallelSimulator
-from envs.grasp.task import Arm, Tools
 
 ROOT = Path(__file__).parents[4]
 SceneBuilder = Callable[..., Scenes]
@@ -35,7 +35,7 @@ def simulate() -> Iterator[Callable[[Scenes], PyBulletSimulator]]:
     simulators = []
 
     def build(scenes: Scenes) -> PyBulletSimulator:
-        simulator = PyBulletSimulator(len(scenes), Support())
+        simulator = PyBulletSimulator(len(scenes), ROBOT, Support())
         simulators.append(simulator)
         simulator.load(np.arange(len(scenes)), scenes, home(len(scenes)))
         return simulator
@@ -306,7 +306,7 @@ def test_intermediate_poses_show_what_two_far_ones_miss(
     start = Tools(joints, np.array([[1.1, -0.35, 0.7]]), np.zeros(1), np.array([[1.0, 0, 0]]))
     simulator, collided = simulate(scene), {}
     for checks in (0, 1, 4, 20):
-        arm = Arm(Workspace(), checks)
+        arm = Arm(ROBOT, Workspace(), checks)
         action = arm.action(np.array([[1.1, 0.35, 0.7]]), np.zeros(1))
         _, path, _ = arm.reach(start, action)
         assert path.shape == (1, checks + 1, 6)
@@ -380,7 +380,7 @@ def test_resetting_the_simulation_changes_nothing(monkeypatch: pytest.MonkeyPatc
                 "resetSimulation",
                 lambda r=reset, log=resets, **k: (log.append(1), r(**k)),
             )
-            simulator = PyBulletSimulator(10, Support())
+            simulator = PyBulletSimulator(10, ROBOT, Support())
             results.append(rollout(simulator, 10))
             simulator.close()
         assert bool(resets) == (loads < 10_000)
@@ -417,15 +417,15 @@ def test_factory_obeys_the_number_of_workers(monkeypatch: pytest.MonkeyPatch) ->
     asked = []
     monkeypatch.setattr(
         "envs.grasp.simulators.factory.ParallelSimulator",
-        lambda worlds, workers, _support: asked.append((worlds, workers)),
+        lambda worlds, workers, _robot, _support: asked.append((worlds, workers)),
     )
     monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: set(range(4)))
     for workers, worlds in ((None, 64), (None, 8), (3, 64), (5, 2)):
-        make_simulator(GraspSettings(workers=workers), worlds)
+        make_simulator(GraspSettings(workers=workers), ROBOT, worlds)
     # One a core, but none with fewer than four worlds; never more workers than worlds.
     assert asked == [(64, 4), (8, 2), (64, 3), (2, 2)]
     for workers, worlds in ((0, 64), (None, 4), (None, 1)):
-        simulator = make_simulator(GraspSettings(workers=workers), worlds)
+        simulator = make_simulator(GraspSettings(workers=workers), ROBOT, worlds)
         assert isinstance(simulator, PyBulletSimulator)
         assert not isinstance(simulator, ParallelSimulator)
         simulator.close()
@@ -433,7 +433,7 @@ def test_factory_obeys_the_number_of_workers(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_closing_twice_does_no_harm() -> None:
-    simulator = PyBulletSimulator(18, Support())
+    simulator = PyBulletSimulator(18, ROBOT, Support())
     clients = [client._id for client in simulator._clients]
     assert len(clients) > 1
     assert all(pybullet.isConnected(client) for client in clients)

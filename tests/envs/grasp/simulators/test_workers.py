@@ -14,7 +14,7 @@ import pytest
 from encoders.spaces import DepthImage
 from envs.environment import EnvironmentFailure
 from envs.grasp.robot.kinematics import InverseKinematics
-from envs.grasp.robot.urdf import HOME_JOINTS_RAD, load_robot
+from envs.grasp.robot.urdf import load_robot
 from envs.grasp.scene.sampler import Scenes, SceneSampler
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Camera, GraspSettings, Support
@@ -23,6 +23,7 @@ from envs.grasp.simulators.pybullet import PyBulletSimulator
 from envs.grasp.simulators.workers import ParallelSimulator
 
 ROOT = Path(__file__).parents[4]
+ROBOT = load_robot()
 COUNT = 7  # not a multiple of the workers
 CAMERAS = {
     "depth": Camera(type="depth", width=48, height=40),
@@ -32,7 +33,7 @@ SPACE = DepthImage(40, 48)
 
 
 def home(count: int) -> np.ndarray:
-    return np.tile(np.array(HOME_JOINTS_RAD), (count, 1))
+    return np.tile(ROBOT.home_rad, (count, 1))
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +46,7 @@ def scenes_and_views() -> tuple[Scenes, dict[str, CameraPoses]]:
 def paths(scenes_and_views: tuple[Scenes, dict[str, CameraPoses]]) -> np.ndarray:
     scenes, _ = scenes_and_views
     near = scenes.target_m + np.random.default_rng(1).uniform(-0.05, 0.05, (COUNT, 3))
-    joints, _ = InverseKinematics(load_robot())(near, scenes.target_yaw_rad)
+    joints, _ = InverseKinematics(ROBOT)(near, scenes.target_yaw_rad)
     part = np.linspace(0.25, 1.0, 4)[None, :, None]
     return home(1)[None] * (1 - part) + joints[:, None] * part
 
@@ -54,14 +55,14 @@ def paths(scenes_and_views: tuple[Scenes, dict[str, CameraPoses]]) -> np.ndarray
 def in_process(
     scenes_and_views: tuple[Scenes, dict[str, CameraPoses]],
 ) -> Iterator[PyBulletSimulator]:
-    simulator = PyBulletSimulator(COUNT, Support())
+    simulator = PyBulletSimulator(COUNT, ROBOT, Support())
     yield simulator
     simulator.close()
 
 
 @pytest.fixture
 def two_workers() -> Iterator[ParallelSimulator]:
-    simulator = ParallelSimulator(COUNT, 2, Support())
+    simulator = ParallelSimulator(COUNT, 2, ROBOT, Support())
     yield simulator
     simulator.close()
 
@@ -155,7 +156,7 @@ def test_a_workers_exception_is_passed_on_and_leaves_no_answer_behind(
 
 
 def test_workers_end_when_the_parent_closes() -> None:
-    simulator = ParallelSimulator(4, 2, Support())
+    simulator = ParallelSimulator(4, 2, ROBOT, Support())
     workers = [worker._process for worker in simulator._workers]
     assert len({worker.pid for worker in workers} | {os.getpid()}) == 3
     simulator.close()
@@ -167,9 +168,10 @@ def test_workers_end_when_the_parent_closes() -> None:
 def test_workers_end_when_the_parent_is_killed() -> None:
     code = (
         "import os, signal\n"
+        "from envs.grasp.robot.urdf import load_robot\n"
         "from envs.grasp.settings import Support\n"
         "from envs.grasp.simulators.workers import ParallelSimulator\n"
-        "simulator = ParallelSimulator(4, 2, Support())\n"
+        "simulator = ParallelSimulator(4, 2, load_robot(), Support())\n"
         "print(*[worker._process.pid for worker in simulator._workers], flush=True)\n"
         "input()\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
