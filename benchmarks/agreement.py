@@ -45,6 +45,7 @@ FIGURES = {
 """What each figure of `Agreement` is, and how much of it there must be."""
 
 ROBOT = load_robot()
+RESOLUTION_M = GraspSettings().contact_resolution_m
 
 Images = NDArray[Any]
 Flags = NDArray[np.bool_]
@@ -82,18 +83,18 @@ class Sample:
         limits = np.full(scenes, np.pi)
         self.scenes, self.views = SceneSampler(settings).sample(self.rng, limits)
         self.everywhere = np.arange(scenes)
-        self._arm = Arm(ROBOT, settings.workspace, settings.motion_checks)
+        self._arm = Arm.of(settings, ROBOT)
         self.start = self._arm.home(scenes)
         self._advance()  # the home pose is out of the camera's sight
 
     def _advance(self) -> NDArray[np.float64]:
         """Goes on to random poses of the workspace; returns the joint paths there."""
         actions = self.rng.uniform(-1.0, 1.0, (len(self.scenes), 4))
-        self.start, path, _ = self._arm.reach(self.start, actions)
+        self.start, path, _ = self._arm.reach(self.start, *self._arm.pose(actions))
         return path
 
     def paths(self, rounds: int) -> list[NDArray[np.float64]]:
-        """Joint paths (n, p, 6) of so many motions one after the other."""
+        """Joint paths (n, 2 k + 1, 6) of so many motions one after the other."""
         return [self._advance() for _ in range(rounds)]
 
 
@@ -219,6 +220,7 @@ def contacts(
     sample: Sample,
     paths: list[NDArray[np.float64]],
     grow_m: float,
+    resolution_m: float = RESOLUTION_M,
 ) -> Flags:
     """Whether motions touched and collided (m, 2), with all boxes grown by `grow_m`."""
     support = Support()
@@ -231,7 +233,9 @@ def contacts(
     simulator = make(len(sample.scenes), ROBOT, support)
     try:
         simulator.load(sample.everywhere, grown(sample.scenes, grow_m), paths[0][:, 0])
-        found: list[Contacts] = [simulator.move(sample.everywhere, path) for path in paths]
+        found: list[Contacts] = [
+            simulator.move(sample.everywhere, path, resolution_m) for path in paths
+        ]
     finally:
         simulator.close()
     return np.concatenate([np.stack([c.touched, c.collided], axis=1) for c in found])

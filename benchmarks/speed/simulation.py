@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.agreement import ROBOT, Sample
+from benchmarks.agreement import RESOLUTION_M, ROBOT, Sample
 from benchmarks.speed.figures import FAST, MODES, PYBULLET, Figures, race, rate
 from encoders.spaces import DepthImage
 from envs.grasp.env import built_in_rewards, make_vector_env
@@ -109,7 +109,8 @@ class _Worlds:
             order = self._rng.permutation(len(sample.scenes))
             sample.scenes, self._views = sample.scenes[order], self._views[order]
             self.simulator.load(sample.everywhere, sample.scenes, sample.start.joints_rad)
-        self.simulator.move(sample.everywhere, *sample.paths(1))
+        (path,) = sample.paths(1)
+        self.simulator.move(sample.everywhere, path, RESOLUTION_M)
         self._pictures += 1
 
     def shoot(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, Field, model_validator
+from pydantic import AfterValidator, BaseModel, Field, field_validator, model_validator
 
 from envs.grasp.scene.blocks import MIN_BAR_M
 
@@ -18,6 +18,8 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
 
 Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
 Point = tuple[float, float, float]
+
+MIN_CONTACT_RESOLUTION_M = 1e-6
 
 
 class Camera(BaseModel, frozen=True, extra="forbid"):
@@ -162,10 +164,9 @@ class Pick(BaseModel, frozen=True, extra="forbid"):
     friction: float = Field(
         0.5, ge=0.0, description="Of blocks and support each; PyBullet multiplies the two."
     )
-    standoff_m: float = Field(
-        0.1, gt=0.0, description="The commanded pose is reached straight from so far behind it."
+    approach_s: float = Field(
+        0.5, gt=0.0, description="How long the straight way from the stand-off to the pose takes."
     )
-    standoff_s: float = Field(0.5, gt=0.0, description="How long that takes.")
     advance_m: float = Field(
         0.05, gt=0.0, description="How far the cup looks for the face from where it was sent."
     )
@@ -218,8 +219,21 @@ class GraspSettings(BaseModel, frozen=True, extra="forbid"):
     grasp_point: Literal["largest_disc", "centroid"] = Field(
         "largest_disc", description="Where to grasp a face."
     )
-    motion_checks: int = Field(
-        4, ge=0, le=100, description="Intermediate poses of a motion checked for contact."
+    motion: Literal["standoff", "direct"] = Field(
+        "standoff",
+        description="How the robot moves: back along the tool's axis, through joint space to a "
+        "stand-off behind the commanded pose, and straight ahead to it; or all the way through "
+        "joint space, as the paper has it.",
+    )
+    standoff_m: float = Field(
+        0.10,
+        gt=0.0,
+        description="How far behind a pose the stand-off is, or as far as the joint limits allow.",
+    )
+    contact_resolution_m: float = Field(
+        0.005,
+        description="No point of the robot that could touch anything moves more than this between "
+        "two looks for contacts.",
     )
     workspace: Workspace = Field(default_factory=Workspace, description="Range of the actions.")
     support: Support = Field(default_factory=Support, description="The table.")
@@ -230,6 +244,16 @@ class GraspSettings(BaseModel, frozen=True, extra="forbid"):
     pick: Pick = Field(
         default_factory=Pick, description="The physical pick of `trainers.evaluate --pick`."
     )
+
+    @field_validator("contact_resolution_m")
+    @classmethod
+    def _resolution_is_finite(cls, value: float) -> float:
+        if not value >= MIN_CONTACT_RESOLUTION_M:
+            raise ValueError(
+                f"{value} m is too fine: a motion would have no end of looks; give "
+                f"{MIN_CONTACT_RESOLUTION_M:g} m or more, such as 0.005"
+            )
+        return value
 
     @model_validator(mode="after")
     def _names_are_free(self) -> GraspSettings:

@@ -79,14 +79,13 @@ class GraspVectorEnv(Environment):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._parameters: dict[str, ParameterValue] = {}
-        self._robot = load_robot()
-        self._arm = Arm(self._robot, settings.workspace, settings.motion_checks)
+        self._arm = Arm.of(settings, load_robot())
         self._sampler = SceneSampler(settings)
         self._everyone = np.arange(self.num_envs)
         self._episodes: RunningEpisodes | None = None
         self._rng = np.random.default_rng(seed)
         self._simulator = make_simulator(
-            settings, self._robot, self.num_envs, render_mode == "human"
+            settings, self._arm.robot, self.num_envs, render_mode == "human"
         )
 
     # -- gymnasium's interface -------------------------------------------------------------------
@@ -205,8 +204,8 @@ class GraspVectorEnv(Environment):
     def _move(self, actions: NDArray[np.float64]) -> GraspTransition:
         """Moves all robots, and brings the episodes up to date."""
         episodes = self._running()
-        after, path, duration_s = self._arm.reach(episodes.tools, actions)
-        contacts = self._simulator.move(self._everyone, path)
+        after, path, duration_s = self._arm.reach(episodes.tools, *self._arm.pose(actions))
+        contacts = self._simulator.move(self._everyone, path, self._settings.contact_resolution_m)
         motion = Motion(episodes.tools, after, duration_s, contacts)
         transition = judge(motion, episodes.scenes, episodes.region, episodes.progress)
         images = episodes.images

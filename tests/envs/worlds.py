@@ -14,6 +14,7 @@ ROBOT = load_robot()
 INVERSE = InverseKinematics(ROBOT)
 HOME = ROBOT.home_rad
 FIRST = np.array([0])
+RESOLUTION_M = GraspSettings().contact_resolution_m
 
 
 def home(count: int) -> np.ndarray:
@@ -37,7 +38,7 @@ def sampled(count: int, seed: int = 0, **cameras: Camera) -> tuple[Scenes, dict[
 
 
 def reaching(scenes: Scenes, seed: int = 0) -> np.ndarray:
-    """Joint paths (n, 5, 6) that end near the targets, so that some touch and some collide."""
+    """Paths (n, 5, 6) that end near the targets, so that some touch and some collide."""
     rng = np.random.default_rng(seed)
     tooltip = scenes.target_m + rng.uniform(-0.06, 0.06, scenes.target_m.shape)
     joints, _ = INVERSE(tooltip, scenes.target_yaw_rad)

@@ -18,6 +18,7 @@ from envs.evaluation import (
 from envs.grasp.evaluation.pick import PickCheck, Picker
 from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.evaluation.report import GraspReport
+from envs.grasp.robot.arm import Arm
 from envs.grasp.robot.urdf import load_robot
 from envs.grasp.settings import GraspSettings
 
@@ -54,7 +55,9 @@ class GraspEvaluator(Evaluator):
 
     def physical_check(self, *, window: bool = False) -> PickCheck:
         """The pick; see `envs.grasp.evaluation.pick`."""
-        picker = Picker(load_robot(), self._settings.support, self._settings.pick, window)
+        settings = self._settings
+        arm = Arm.of(settings, load_robot())
+        picker = Picker(arm, settings.support, settings.pick, window)
         return PickCheck(picker, self._pose_commands)
 
     def pictures(self) -> GraspReport:

@@ -10,9 +10,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from envs.grasp.evaluation.pick import STEP_S, Attempt, Picker
 from envs.grasp.evaluation.pose_errors import Sample
+from envs.grasp.robot.arm import Arm
 from envs.grasp.robot.urdf import load_robot
 from envs.grasp.sensors.camera import overviews
-from envs.grasp.settings import Pick, Support
+from envs.grasp.settings import GraspSettings
 
 WIDTH_PX, HEIGHT_PX, CAPTION_PX = 480, 360, 28
 # GIF counts in hundredths of a second.
@@ -27,13 +28,12 @@ LIGHT = {
 }
 
 
-def film(shots: Sequence[Sample], support: Support, settings: Pick, pick: bool) -> bytes:
+def film(shots: Sequence[Sample], settings: GraspSettings, pick: bool) -> bytes:
     """Films some commands one after the other, from the robot's home on.
 
     Args:
         shots: what to film, one or more.
-        support: the table.
-        settings: of the pick.
+        settings: the task.
         pick: go on to pick up the block; otherwise the film ends at the commanded pose.
 
     Returns:
@@ -41,7 +41,7 @@ def film(shots: Sequence[Sample], support: Support, settings: Pick, pick: bool) 
     """
     frames: list[Image.Image] = []
     durations: list[int] = []
-    picker = Picker(load_robot(), support, settings)
+    picker = Picker(Arm.of(settings, load_robot()), settings.support, settings.pick)
     try:
         for number, shot in enumerate(shots, 1):
             captured = _Camera(f"{number} of {len(shots)}   {shot.caption}")

@@ -17,13 +17,9 @@ import pybullet
 from numpy.typing import NDArray
 
 from envs.grasp.evaluation.pose_commands import PoseCommands
-from envs.grasp.robot.kinematics import (
-    InverseKinematics,
-    grasp_pose,
-    motion_duration_s,
-    tooltip_pose,
-)
-from envs.grasp.robot.urdf import Robot
+from envs.grasp.robot.arm import Arm
+from envs.grasp.robot.kinematics import InverseKinematics, tooltip_pose
+from envs.grasp.robot.paths import duration_s, path_poses
 from envs.grasp.scene.sampler import Scenes, to_world
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Pick, Support
@@ -90,7 +86,7 @@ class Picker:
     """Carries out picks, one after the other. They are deterministic, whatever came before them.
 
     Args:
-        robot: picks.
+        arm: picks.
         support: the table.
         settings: masses, frictions, forces and ways.
         window: show the picks in PyBullet's window, as fast as they would go.
@@ -99,8 +95,8 @@ class Picker:
         ValueError: a window is asked for where none can be opened.
     """
 
-    def __init__(self, robot: Robot, support: Support, settings: Pick, window: bool = False):
-        self._robot, self._support, self._settings = robot, support, settings
+    def __init__(self, arm: Arm, support: Support, settings: Pick, window: bool = False):
+        self._arm, self._support, self._settings = arm, support, settings
         self._window = window
         self._client = open_client(window)
 
@@ -141,7 +137,7 @@ class Picker:
             time.sleep(STEP_S)
 
         shown = at_its_pace if self._window else watch
-        return Attempt(self._client, self._robot, self._support, self._settings, scene, shown)
+        return Attempt(self._client, self._arm, self._support, self._settings, scene, shown)
 
 
 class PickCheck:
@@ -178,7 +174,7 @@ class Attempt:
 
     Args:
         client: PyBullet's; what it holds is removed.
-        robot: picks.
+        arm: picks.
         support: the table.
         settings: masses, frictions, forces and ways.
         scene: one row.
@@ -188,22 +184,22 @@ class Attempt:
     def __init__(
         self,
         client: int,
-        robot: Robot,
+        arm: Arm,
         support: Support,
         settings: Pick,
         scene: Scenes,
         watch: Watch = unwatched,
     ):
         self._id, self._settings, self._scene, self._watch = client, settings, scene, watch
-        self._kinematics = robot
-        self._inverse = InverseKinematics(self._kinematics)
+        self._arm, self._kinematics = arm, arm.robot
+        self._inverse = InverseKinematics(arm.robot)
         # Nothing that a solver remembers of an earlier pick can change this one.
         pybullet.resetSimulation(physicsClientId=client)
         pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)
         pybullet.setTimeStep(STEP_S, physicsClientId=client)
         pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
-        self._robot = add_robot(client, robot)
-        self._joints_rad = robot.home_rad
+        self._robot = add_robot(client, arm.robot)
+        self._joints_rad = arm.robot.home_rad
         set_joints(client, self._robot, self._joints_rad)
         table = add_support(client, support)
         blocks = [self._add_block(number) for number in range(scene.box_half_m.shape[1])]
@@ -215,20 +211,19 @@ class Attempt:
         self._start_height_m = self.target_pose()[0][2]
 
     def reach(self, tooltip_m: Floats, yaw_rad: float) -> Touch:
-        """Drives from home to a pose; stops where it touches.
+        """Drives from home to a pose as the task does; stops where it touches.
 
-        First through joint space to a place behind that pose, no joint faster than it can, then
-        straight ahead: the straight way through joint space would lead through the block.
+        No joint is faster than it can, and the tool comes to rest at the stand-off.
         """
-        settings, pose = self._settings, grasp_pose(tooltip_m, np.array(yaw_rad))
-        behind_m = settings.standoff_m * (_smooth(settings.standoff_s) - 1.0)
-        ahead, reached = self._straight(pose, behind_m, pose[:3, 2])
-        # From as far back as the arm can go.
-        first = np.flatnonzero(~reached).max(initial=-1) + 1
-        ahead = ahead[min(first, len(ahead) - 1) :]
-        start, turn = self._joints_rad, ahead[0] - self._joints_rad
-        duration_s = SMOOTH_PEAK * float(motion_duration_s(self._kinematics, start, ahead[0]))
-        return self._follow([*(start + _smooth(duration_s)[:, None] * turn), *ahead])
+        home = self._arm.home(1)
+        tools, path, _ = self._arm.reach(home, tooltip_m[None], np.array([yaw_rad]))
+        ahead = tools.approach_rad[0]
+        transit = path[0, len(ahead) - 1 :][:3]  # from home there is nothing to retreat from
+        transit_s = SMOOTH_PEAK * float(duration_s(self._kinematics, transit))
+        touch = self._follow(path_poses(transit, _smooth(transit_s)))
+        if touch is Touch.NOTHING:
+            touch = self._follow(path_poses(ahead, _smooth(self._settings.approach_s)))
+        return touch
 
     def advance(self) -> Touch:
         """Moves the cup ahead from the reached pose until it touches or its way ends.

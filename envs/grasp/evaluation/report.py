@@ -70,7 +70,7 @@ class GraspReport:
         yield episodes, contact_sheet(self._shots, goal_middle_m(settings.goal))
         yield errors, error_histograms(judged, settings.goal)
         yield places, workspace(judged)
-        yield moving, film(self._shots[:FILMED], settings.support, settings.pick, self._picked)
+        yield moving, film(self._shots[:FILMED], settings, self._picked)
 
     def _judge(
         self, commands: PoseCommands, outcomes: Mapping[str, NDArray[np.bool_]]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from envs.grasp.robot.urdf import Robot
+from envs.grasp.robot.urdf import Primitive, Robot
 
 _AXES = ((0, 0, -1), (0, 1, 0), (0, 1, 0), (-1, 0, 0), (0, 1, 0), (-1, 0, 0))
 # Below this sine of A5 the axes A4 and A6 are one line and only their sum is determined.
@@ -94,7 +94,7 @@ class InverseKinematics:
     """
 
     def __init__(self, robot: Robot):
-        self._arm = _arm(robot)
+        self._arm = arm_lengths(robot)
         self._last_link = np.linalg.inv(robot.tooltip)
         self._lower_rad, self._upper_rad = robot.lower_rad, robot.upper_rad
 
@@ -126,37 +126,39 @@ class InverseKinematics:
         return np.clip(joints, self._lower_rad, self._upper_rad), reached
 
 
-def joint_path(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
-    """Evenly spaced joint angles on the straight way through joint space.
+def shape_reach(robot: Robot) -> np.ndarray:
+    """Upper bounds (S, J) in metres: how far points of shapes are from joints, whatever the angles.
 
-    Args:
-        start: (..., J) angles in radians, not part of the path.
-        end: (..., J) angles in radians, the path's last.
-        count: Number of poses, at least 1.
-
-    Returns:
-        (..., count, J) angles in radians.
-
-    Raises:
-        ValueError: `count` is less than 1.
+    The S shapes are those of `robot.link_primitives` one after the other. Zero where the joint does
+    not move the shape: turned by dq, the joint moves no point of it by more than |dq| times this.
     """
-    if count < 1:
-        raise ValueError(f"a path needs at least 1 pose, not {count}")
-    part = (np.arange(1, count + 1) / count)[:, None]
-    start, end = np.asarray(start)[..., None, :], np.asarray(end)[..., None, :]
-    return start * (1.0 - part) + end * part
+    return np.array(
+        [
+            _reach_from_joints(robot, link, shape)
+            for link, shapes in enumerate(robot.link_primitives)
+            for shape in shapes
+        ]
+    )
 
 
-def motion_duration_s(robot: Robot, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Time (...) of a motion from `start` to `end`, both (..., J) in radians.
+def _reach_from_joints(robot: Robot, link: int, shape: Primitive) -> np.ndarray:
+    """A row (J,) of `shape_reach`."""
+    reach, point, further_m = (
+        np.zeros(len(robot.joint_axes)),
+        shape.pose[:3, 3],
+        shape.bounding_radius_m,
+    )
+    while link >= 0:
+        if (joint := robot.link_joints[link]) >= 0:
+            # From here on the point is anywhere on a ball about the joint.
+            further_m += float(np.linalg.norm(point))
+            reach[joint], point = further_m, np.zeros(3)
+        point = robot.link_origins[link, :3, :3] @ point + robot.link_origins[link, :3, 3]
+        link = robot.link_parents[link]
+    return reach
 
-    The slowest joint moves at its largest speed, the others keep pace with it. Acceleration is
-    left out.
-    """
-    return np.max(np.abs(np.asarray(end) - np.asarray(start)) / robot.max_speed_rad_s, axis=-1)
 
-
-class _Arm(NamedTuple):
+class ArmLengths(NamedTuple):
     """The lengths (m) that place the wrist's centre."""
 
     height: float
@@ -166,7 +168,12 @@ class _Arm(NamedTuple):
     forearm_rise: float
 
 
-def _arm(robot: Robot) -> _Arm:
+def arm_lengths(robot: Robot) -> ArmLengths:
+    """The lengths of a robot.
+
+    Raises:
+        ValueError: It is not built like the KR 16.
+    """
     moved = [link for link, joint in enumerate(robot.link_joints) if joint >= 0]
     origins = robot.link_origins[moved]
     offsets = origins[:, :3, 3]
@@ -184,7 +191,7 @@ def _arm(robot: Robot) -> _Arm:
             f"{robot.path}: the closed-form inverse needs axes and a spherical wrist as the "
             f"KR 16 has them (axes {_AXES}, A4, A5 and A6 meeting in a point)"
         )
-    return _Arm(
+    return ArmLengths(
         height=float(offsets[0, 2]),
         shoulder=float(offsets[1, 0]),
         upper_arm=float(offsets[2, 0]),
@@ -194,18 +201,39 @@ def _arm(robot: Robot) -> _Arm:
 
 
 @numba.njit(cache=True)
-def _solve(arm: _Arm, frames: np.ndarray, joints: np.ndarray, near_enough: np.ndarray) -> None:
+def _solve(
+    arm: ArmLengths, frames: np.ndarray, joints: np.ndarray, near_enough: np.ndarray
+) -> None:
     """Writes the joints (n, 6) that bring the last link to frames (n, 4, 4).
 
     `near_enough` (n,) is set where the wrist's centre is.
     """
     for row in range(len(frames)):
-        near_enough[row] = _place_wrist(arm, frames[row, :3, 3], joints[row])
-        _turn_wrist(frames[row], joints[row])
+        near_enough[row] = solve_frame(arm, frames[row], joints[row])
 
 
 @numba.njit(cache=True)
-def _place_wrist(arm: _Arm, centre: np.ndarray, joints: np.ndarray) -> bool:
+def solve_frame(arm: ArmLengths, frame: np.ndarray, joints: np.ndarray) -> bool:
+    """Writes the joints (6,) that bring the last link to a frame (4, 4).
+
+    Returns whether they do, for all that the arm's lengths have to say; limits are not looked at.
+    """
+    near_enough = _place_wrist(arm, frame[:3, 3], joints)
+    _turn_wrist(frame, joints)
+    return near_enough
+
+
+@numba.njit(cache=True)
+def within(joints: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> bool:
+    """Whether joints (J,) are within their limits, but for rounding."""
+    for joint in range(len(joints)):
+        if not lower[joint] - _SLACK <= joints[joint] <= upper[joint] + _SLACK:
+            return False
+    return True
+
+
+@numba.njit(cache=True)
+def _place_wrist(arm: ArmLengths, centre: np.ndarray, joints: np.ndarray) -> bool:
     """Writes A1, A2, A3 for the wrist's centre (3,); False if it is too far or too near."""
     reach, rise = math.hypot(centre[0], centre[1]) - arm.shoulder, centre[2] - arm.height
     # The triangle shoulder, elbow, wrist: d^2 = u^2 + f^2 + 2 u f cos(bend)

@@ -21,6 +21,11 @@ class Box:
     half_extents_m: np.ndarray
     pose: np.ndarray
 
+    @property
+    def bounding_radius_m(self) -> float:
+        """Radius of the ball about it."""
+        return float(np.linalg.norm(self.half_extents_m))
+
 
 @dataclass(frozen=True, eq=False)
 class Cylinder:
@@ -29,6 +34,11 @@ class Cylinder:
     radius_m: float
     length_m: float
     pose: np.ndarray
+
+    @property
+    def bounding_radius_m(self) -> float:
+        """Radius of the ball about it, which goes through its rims."""
+        return float(np.hypot(self.radius_m, self.length_m / 2.0))
 
 
 Primitive = Box | Cylinder

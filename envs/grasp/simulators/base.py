@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
 from envs.environment import EnvironmentFailure
+from envs.grasp.robot.paths import Path
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses
 
@@ -45,8 +46,18 @@ class Simulator(Protocol):
     def load(self, indices: Indices, scenes: Scenes, joints_rad: Floats) -> None:
         """Puts the blocks of n scenes in place and the robots' joints at (n, 6)."""
 
-    def move(self, indices: Indices, path_rad: Floats) -> Contacts:
-        """Moves n robots along joint poses (n, p, 6), and stays at the last one."""
+    def move(self, indices: Indices, path_rad: Path, resolution_m: float) -> Contacts:
+        """Moves n robots along paths, and stays at their ends.
+
+        Args:
+            indices: the worlds (n,).
+            path_rad: (n, 2 k + 1, 6), see `envs.grasp.robot.paths`; one knot is a pose.
+            resolution_m: no point of the robot that could touch anything moves more than this
+                between two looks. What nothing can touch before the next look is not looked at.
+
+        Returns:
+            What was touched anywhere along the paths, their ends included.
+        """
 
     def render(self, indices: Indices, views: CameraPoses) -> Images:
         """Takes n pictures.

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
+from envs.grasp.robot.kinematics import shape_reach
+from envs.grasp.robot.paths import Path, check_knots
 from envs.grasp.robot.urdf import Box, Robot
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses, focal_length_px
@@ -81,20 +83,31 @@ class FastSimulator:
         worlds.joints[indices, 0] = joints_rad
         self._loaded[indices] = True
 
-    def move(self, indices: Indices, path_rad: Floats) -> Contacts:
+    def move(self, indices: Indices, path_rad: Path, resolution_m: float) -> Contacts:
         """See `Simulator.move`.
 
         Raises:
-            ValueError: a joint angle is not finite, or a world holds no scene.
+            ValueError: a joint angle is not finite, the number of knots is even, the resolution is
+                not positive, or a world holds no scene.
         """
         indices = self._checked(indices, loaded=True)
-        if np.ndim(path_rad) != 3 or np.shape(path_rad)[1] < 1:
-            raise ValueError(f"a path has the shape (n, p, J), p at least 1, not {path_rad.shape}")
+        check_knots(path_rad)
+        if not resolution_m > 0.0:
+            raise ValueError(f"a resolution of {resolution_m} m: it must be over 0")
         shape = (len(indices), path_rad.shape[1], len(self._robot.axes))
         _check(path_rad, shape, "path_rad")
         touched, collided = np.zeros(len(indices), bool), np.zeros(len(indices), bool)
         path = np.ascontiguousarray(path_rad, np.float64)
-        touch = partial(touch_along, self._robot, self._worlds, indices, path, touched, collided)
+        touch = partial(
+            touch_along,
+            self._robot,
+            self._worlds,
+            indices,
+            path,
+            float(resolution_m),
+            touched,
+            collided,
+        )
         self._threads.parallel_for(touch, len(indices))
         self._worlds.joints[indices, 0] = path[:, -1]
         return Contacts(touched, collided)
@@ -210,8 +223,6 @@ def robot_arrays(robot: Robot) -> RobotArrays:
     )
     is_cylinder = np.array([not isinstance(shape, Box) for _, shape in shapes])
     links = np.array([link for link, _ in shapes], np.int64)
-    # A cylinder's ball goes through its rims, not through the corners of the box about it.
-    corner = np.where(is_cylinder[:, None], half * [1.0, 0.0, 1.0], half)
     return RobotArrays(
         parents=np.array(robot.link_parents, np.int64),
         joints=np.array(robot.link_joints, np.int64),
@@ -220,7 +231,8 @@ def robot_arrays(robot: Robot) -> RobotArrays:
         shape_links=links,
         shape_poses=np.array([shape.pose for _, shape in shapes]),
         shape_half=half,
-        shape_radius=np.linalg.norm(corner, axis=1),
+        shape_radius=np.array([shape.bounding_radius_m for _, shape in shapes]),
+        shape_reach=shape_reach(robot),
         is_cylinder=is_cylinder,
         is_cup=links == robot.cup_link,
         shape_colors=_color_levels(robot.link_colors[links]),

@@ -11,6 +11,8 @@ import pybullet
 from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
+from envs.grasp.robot.kinematics import shape_reach
+from envs.grasp.robot.paths import Path, leg_poses, leg_speeds, legs
 from envs.grasp.robot.urdf import Robot
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses, focal_length_px
@@ -39,6 +41,8 @@ CLIENTS_PER_PROCESS = 8
 LOADS_BEFORE_RESET = 400
 PARKED_M = [0.0, 0.0, -1000.0]
 WINDOW_POSE_S = 0.04
+# Distances are asked for up to this: PyBullet takes longer the more it has to measure.
+SIGHT_M = 0.1
 
 
 class PyBulletSimulator:
@@ -62,12 +66,12 @@ class PyBulletSimulator:
             client, slot = self._place(index)
             client.load(slot, scenes[row : row + 1], joints_rad[row])
 
-    def move(self, indices: Indices, path_rad: Floats) -> Contacts:
+    def move(self, indices: Indices, path_rad: Path, resolution_m: float) -> Contacts:
         """See `Simulator.move`."""
         flags = np.zeros((len(indices), 2), bool)
         for row, index in enumerate(indices):
             client, slot = self._place(index)
-            flags[row] = client.move(slot, path_rad[row])
+            flags[row] = client.move(slot, path_rad[row], resolution_m)
         return Contacts(touched=flags[:, 0], collided=flags[:, 1])
 
     def render(self, indices: Indices, views: CameraPoses) -> Images:
@@ -101,6 +105,24 @@ class PyBulletSimulator:
 
 
 @dataclass
+class _Found:
+    """What was touched so far."""
+
+    touched: bool = False
+    collided: bool = False
+
+    @property
+    def all(self) -> bool:
+        """Whether there is nothing more to be found."""
+        return self.touched and self.collided
+
+    def add(self, *, on_target: bool) -> None:
+        """Takes down a contact: the cup's with the target, or another."""
+        self.touched |= on_target
+        self.collided |= not on_target
+
+
+@dataclass
 class _World:
     """What one client remembers of one of its worlds."""
 
@@ -120,6 +142,7 @@ class _Client:
 
     def __init__(self, robot: Robot, support: Support, window: bool):
         self._kinematics, self._support = robot, support
+        self._reach_m = np.max(shape_reach(robot), axis=0)
         self._pause_s = WINDOW_POSE_S if window else 0.0
         self._id = open_client(window)
         self._worlds: dict[int, _World] = {}
@@ -142,23 +165,21 @@ class _Client:
         else:
             self._add_blocks(self._worlds[slot])
 
-    def move(self, slot: int, path_rad: Floats) -> tuple[bool, bool]:
-        """Moves along joint poses (p, 6); returns whether it touched, and whether it collided."""
+    def move(self, slot: int, path_rad: Path, resolution_m: float) -> tuple[bool, bool]:
+        """Moves along a path (2 k + 1, 6); returns whether it touched, and whether it collided."""
         self._activate(slot)
-        world = self._worlds[slot]
-        touched = collided = False
-        for joints_rad in path_rad:
-            set_joints(self._id, self._robot, joints_rad)
-            for number, body in enumerate((*world.blocks, self._table)):
-                for link in self._touching_links(body):
-                    if link == self._robot.cup and number == 0:
-                        touched = True
-                    else:
-                        collided = True
-            if self._pause_s:
-                time.sleep(self._pause_s)
-        world.joints_rad = path_rad[-1]
-        return touched, collided
+        found = _Found()
+        for leg in legs(path_rad):
+            # No point of the robot moves further than this on the leg.
+            way_m = float(leg_speeds(leg) @ self._reach_m)
+            part = 0.0
+            while part < 1.0 and way_m > 0.0 and not found.all:
+                joints_rad = leg_poses(leg, np.array([part]))[0]
+                clear_m = self._look(self._worlds[slot], joints_rad, found)
+                part += max(clear_m, resolution_m) / way_m
+        self._look(self._worlds[slot], path_rad[-1], found)
+        self._worlds[slot].joints_rad = path_rad[-1]
+        return found.touched, found.collided
 
     def render(
         self, slot: int, camera: Camera, view: list[float], projection: list[float]
@@ -199,12 +220,27 @@ class _Client:
         set_joints(self._id, self._robot, world.joints_rad)
         self._active = slot
 
-    def _touching_links(self, body: int) -> list[int]:
-        """Links of the robot that touch or enter a body."""
-        points = pybullet.getClosestPoints(
-            self._robot.body, body, distance=0.0, physicsClientId=self._id
-        )
-        return [point[3] for point in points]
+    def _look(self, world: _World, joints_rad: Floats, found: _Found) -> float:
+        """Puts the robot somewhere, and adds what it touches there to what was found.
+
+        Returns:
+            The distance in metres to what it does not touch yet, `SIGHT_M` at most.
+        """
+        set_joints(self._id, self._robot, joints_rad)
+        if self._pause_s:
+            time.sleep(self._pause_s)
+        clear_m = SIGHT_M
+        for number, body in enumerate((*world.blocks, self._table)):
+            for point in pybullet.getClosestPoints(
+                self._robot.body, body, distance=SIGHT_M, physicsClientId=self._id
+            ):
+                link, distance_m = point[3], point[8]
+                on_target = link == self._robot.cup and number == 0
+                if distance_m <= 0.0:
+                    found.add(on_target=on_target)
+                elif not (found.touched if on_target else found.collided):
+                    clear_m = min(clear_m, distance_m)
+        return clear_m
 
 
 def view_matrices(views: CameraPoses) -> list[list[float]]:

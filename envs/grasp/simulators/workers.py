@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
+from envs.grasp.robot.paths import Path
 from envs.grasp.robot.urdf import Robot
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses
@@ -47,9 +48,9 @@ class ParallelSimulator:
         """See `Simulator.load`."""
         self._call("load", indices, scenes, joints_rad)
 
-    def move(self, indices: Indices, path_rad: Floats) -> Contacts:
+    def move(self, indices: Indices, path_rad: Path, resolution_m: float) -> Contacts:
         """See `Simulator.move`."""
-        parts: list[Contacts] = self._call("move", indices, path_rad)
+        parts: list[Contacts] = self._call("move", indices, path_rad, resolution_m)
         return Contacts(
             np.concatenate([part.touched for part in parts]),
             np.concatenate([part.collided for part in parts]),
@@ -71,12 +72,12 @@ class ParallelSimulator:
             self._workers.pop().close()
 
     def _call(self, method: str, indices: Indices, *arguments: Any) -> list[Any]:
-        """Calls a method with each worker's rows of the arguments; a space goes to all as it is."""
+        """Calls a method with each worker's rows of the arguments; what has no rows goes to all."""
         owners = np.searchsorted(self._starts, indices, side="right") - 1
         busy = []
         for number in np.unique(owners):
             rows = np.flatnonzero(owners == number)
-            part = [a if isinstance(a, DepthImage) else a[rows] for a in arguments]
+            part = [a if isinstance(a, DepthImage | float) else a[rows] for a in arguments]
             self._workers[number].send((method, indices[rows] - self._starts[number], *part))
             busy.append(self._workers[number])
         replies, failures = [], []

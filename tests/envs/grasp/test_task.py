@@ -1,18 +1,13 @@
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from envs.grasp.robot.arm import Arm, Tools
-from envs.grasp.robot.kinematics import tooltip_pose
-from envs.grasp.robot.urdf import load_robot
+from envs.grasp.robot.arm import Tools
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.settings import Goal, Workspace
+from envs.grasp.settings import Goal
 from envs.grasp.simulators.base import Contacts
 from envs.grasp.task import (
     EpisodeProgress,
@@ -23,77 +18,6 @@ from envs.grasp.task import (
     judge,
     yaw_error,
 )
-
-ROBOT = load_robot()
-ARM = Arm(ROBOT, Workspace(), motion_checks=4)
-unit = st.floats(-1, 1)
-
-
-def test_actions_map_linearly_onto_the_workspace() -> None:
-    tooltip, yaw = ARM.pose(np.array([[-1, -1, -1, -1], [0, 0, 0, 0], [1, 1, 1, 1], [0.5] * 4]))
-    np.testing.assert_allclose(
-        tooltip, [[0.82, -0.45, 0.6], [1.085, 0, 0.8], [1.35, 0.45, 1.0], [1.2175, 0.225, 0.9]]
-    )
-    np.testing.assert_allclose(np.degrees(yaw), [-40, 0, 40, 20], atol=1e-12)
-
-
-@given(st.lists(st.tuples(unit, unit, unit, unit), min_size=1, max_size=4))
-def test_actions_survive_the_round_trip(rows: list[tuple[float, ...]]) -> None:
-    actions = np.array(rows)
-    np.testing.assert_allclose(ARM.action(*ARM.pose(actions)), actions, atol=1e-9)
-
-
-def test_actions_beyond_the_workspace_are_clipped() -> None:
-    far = np.array([[3.0, -7.0, 1.5, -1.1]])
-    np.testing.assert_array_equal(ARM.pose(far)[0], ARM.pose(np.sign(far))[0])
-    np.testing.assert_array_equal(ARM.pose(far)[1], ARM.pose(np.sign(far))[1])
-
-
-def reached(actions: np.ndarray) -> None:
-    """Asserts that the joints are within their limits and lead to the pose that was asked for."""
-    tools, path, duration = ARM.reach(ARM.home(len(actions)), actions)
-    assert (path >= ROBOT.lower_rad - 1e-9).all()
-    assert (path <= ROBOT.upper_rad + 1e-9).all()
-    frame = tooltip_pose(ROBOT, path[:, -1])
-    tooltip, yaw = ARM.pose(actions)
-    np.testing.assert_allclose(frame[:, :3, 3], tooltip, atol=1e-9)
-    ahead = np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], -1)
-    np.testing.assert_allclose(frame[:, :3, 2], ahead, atol=1e-9)  # the cup's face is vertical
-    np.testing.assert_allclose(tools.axis, ahead, atol=1e-12)
-    np.testing.assert_allclose(tools.tooltip_m, tooltip)
-    np.testing.assert_allclose(tools.joints_rad, path[:, -1])
-    assert (duration > 0).all()
-
-
-def test_every_corner_of_the_workspace_is_reachable() -> None:
-    reached(np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=4))))
-
-
-@settings(max_examples=50)
-@given(st.lists(st.tuples(unit, unit, unit, unit), min_size=1, max_size=8))
-def test_every_pose_of_the_workspace_is_reachable(rows: list[tuple[float, ...]]) -> None:
-    reached(np.array(rows))
-
-
-def test_path_is_evenly_spaced_from_where_the_robot_is() -> None:
-    first, _, _ = ARM.reach(ARM.home(1), np.array([[0.3, -0.5, 0.2, 0.1]]))
-    second, path, duration = ARM.reach(first, np.array([[-0.3, 0.5, 0.0, -0.1]]))
-    assert path.shape == (1, 5, 6)
-    steps = np.diff(np.concatenate([first.joints_rad[:, None], path], axis=1), axis=1)
-    np.testing.assert_allclose(steps, np.broadcast_to(steps[:, :1], steps.shape), atol=1e-12)
-    np.testing.assert_allclose(path[:, -1], second.joints_rad)
-    slowest = np.abs(second.joints_rad - first.joints_rad) / ROBOT.max_speed_rad_s
-    assert duration[0] == pytest.approx(slowest.max())
-
-
-def test_home() -> None:
-    tools = ARM.home(2)
-    np.testing.assert_array_equal(tools.joints_rad, [ROBOT.home_rad] * 2)
-    frame = tooltip_pose(ROBOT, tools.joints_rad)
-    np.testing.assert_allclose(tools.tooltip_m, frame[:, :3, 3])
-    np.testing.assert_allclose(tools.axis, frame[:, :3, 2])
-    np.testing.assert_array_equal(tools.yaw_rad, 0.0)
-
 
 # -- goal ------------------------------------------------------------------------------------------
 
@@ -168,7 +92,7 @@ def test_yaw_errors_wrap(yaw: float, target: float, error: float) -> None:
 
 def tools(tooltip: np.ndarray, yaw: np.ndarray) -> Tools:
     axis = np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], -1)
-    return Tools(np.zeros((len(yaw), 6)), tooltip, yaw, axis)
+    return Tools(np.zeros((len(yaw), 3, 6)), tooltip, yaw, axis)
 
 
 def test_judge_and_advance(box_scene: Callable[..., Scenes]) -> None:

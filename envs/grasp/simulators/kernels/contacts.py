@@ -1,14 +1,30 @@
-"""Whether the robot's boxes and cylinders touch the boxes of its world.
+"""What the robot's boxes and cylinders touch of the boxes of its world along a motion.
 
-Balls about the shapes tell most pairs apart; the others are tested exactly.
+Conservative advancement: a shape that is a distance away from everything, and none of whose points
+moves faster than a bound, touches nothing for the time that is their quotient, and is looked at
+again after it. Where shapes are nearer than the resolution, that is taken for the distance.
+Mirtich, "Impulse-based dynamic simulation of rigid body systems", 1996, section 2.3.
+
+A point p that joints move is known to within its acceleration: with
+joint k further out than joint j or the same, d2p/dq_j dq_k = a_j x (a_k x (p - o_k)), which is no
+longer than the point's distance from joint k. So in a time t no point of a shape moves further than
+v t + A t^2 / 2, where v is the largest speed of a point of its ball now and
+A = sum_k |q'_k| L_k (|q'_k| + 2 sum_{j<k} |q'_j|) + sum_k |q''_k| L_k, L_k its reach from joint k.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
+from envs.grasp.simulators.kernels.pairs import (
+    Pair,
+    gap_between,
+    make_pair,
+    meets,
+)
 from envs.grasp.simulators.kernels.worlds import (
     Bools,
     Floats,
@@ -17,6 +33,7 @@ from envs.grasp.simulators.kernels.worlds import (
     Vector,
     WorldArrays,
     column_in_world,
+    cross,
     dot,
     in_world,
     kernel,
@@ -25,28 +42,28 @@ from envs.grasp.simulators.kernels.worlds import (
     triple,
 )
 
-# Added to the products of edges: of parallel ones nothing would be left but rounding errors.
-PARALLEL_EDGES = 1e-9
-CONVERGED_M2 = 1e-14
-MAX_ITERATIONS = 64
-BOX_EDGES = 12
-
 
 class Room(NamedTuple):
     """Room to work in, for one thread.
 
     Attributes:
+        leg: (3, J) a leg's joint angles at its start, their first and their second derivatives.
+        pose: (1, 1, J) joint angles now.
+        speeds: (J,) first derivatives now.
         frames: (L, 3, 4) of the links.
-        offset: (3,) from a box to a shape, in the box's frame.
-        turn, size: (3, 3) a shape's axes in a box's frame, and their absolute values.
-        points: (24, 2) projected to a cylinder's end.
+        turns, drifts: (L, 3) angular velocities of the links, and velocities of their origins.
+        bends: (S,) largest accelerations of the shapes' points on the leg.
+        idle: (S,) whether nothing more can happen to the shapes on the leg.
     """
 
+    leg: Floats
+    pose: Floats
+    speeds: Floats
     frames: Floats
-    offset: Floats
-    turn: Floats
-    size: Floats
-    points: Floats
+    turns: Floats
+    drifts: Floats
+    bends: Floats
+    idle: Bools
 
 
 @kernel(nogil=True)
@@ -55,239 +72,301 @@ def touch_along(
     worlds: WorldArrays,
     indices: Integers,
     paths: Floats,
+    resolution: float,
     touched: Bools,
     collided: Bools,
     begin: int,
     end: int,
 ) -> None:
-    """Tells what robots touch along joint poses; where they stand is left as it is.
+    """Tells what robots touch along paths; where they stand is left as it is.
 
     Args:
         robot: the robot.
         worlds: where the boxes are.
         indices: (n,) the worlds.
-        paths: (n, p, J) joint angles in radians.
+        paths: (n, 2 k + 1, J) knots in radians, see `envs.grasp.robot.paths`.
+        resolution: in metres, see `envs.grasp.simulators.base.Simulator.move`.
         touched: (n,) written, see `envs.grasp.simulators.base.Contacts`.
         collided: (n,) written.
         begin: first row that is meant.
         end: row before which to end.
     """
-    room = Room(
-        np.empty((len(robot.parents), 3, 4)),
-        np.empty(3),
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty((2 * BOX_EDGES, 2)),
+    joints, links, shapes = len(robot.axes), len(robot.parents), len(robot.shape_links)
+    room, pair = (
+        Room(
+            np.empty((3, joints)),
+            np.empty((1, 1, joints)),
+            np.empty(joints),
+            np.empty((links, 3, 4)),
+            np.zeros((links, 3)),
+            np.zeros((links, 3)),
+            np.empty(shapes),
+            np.empty(shapes, np.bool_),
+        ),
+        make_pair(),
     )
     for row in range(begin, end):
-        touched[row], collided[row] = _contacts(robot, worlds, indices[row], paths, row, room)
+        touched[row], collided[row] = _contacts(
+            robot, worlds, indices[row], paths, row, resolution, room, pair
+        )
 
 
-@kernel()
+@kernel(counts=False)
 def _contacts(
-    robot: RobotArrays, worlds: WorldArrays, world: int, paths: Floats, row: int, room: Room
+    robot: RobotArrays,
+    worlds: WorldArrays,
+    world: int,
+    paths: Floats,
+    row: int,
+    resolution: float,
+    room: Room,
+    pair: Pair,
 ) -> tuple[bool, bool]:
     """Whether one motion touches, and whether it collides."""
     touched = collided = False
-    links, poses, half, radii = (
-        robot.shape_links,
-        robot.shape_poses,
-        robot.shape_half,
-        robot.shape_radius,
-    )
-    frames, middles, axes = room.frames, worlds.center, worlds.axes
-    sizes, reaches, is_target = worlds.half, worlds.radius, worlds.is_target
-    for pose in range(paths.shape[1]):
-        move_links(robot.parents, robot.joints, robot.origins, robot.axes, paths, row, pose, frames)
-        for shape in range(len(links)):
-            is_cup, radius, link = robot.is_cup[shape], radii[shape], links[shape]
-            if collided and (touched or not is_cup):
-                continue
-            center = in_world(
-                frames, link, poses[shape, 0, 3], poses[shape, 1, 3], poses[shape, 2, 3]
+    legs = _legs_that_count(paths, row)
+    for leg in range(legs):
+        if not _begin_leg(paths, row, leg, robot.shape_reach, room):
+            continue
+        part = 0.0
+        # Where a leg ends the next one begins, and is looked at then.
+        while part < 1.0:
+            touched, collided, part = _look(
+                robot, worlds, world, part, resolution, touched, collided, room, pair
             )
-            if _leaves_room(worlds.low, worlds.high, world, center, radius):
-                continue
-            for box in range(sizes.shape[1]):
-                touch = is_cup and is_target[world, box]
-                if reaches[world, box] == 0.0 or (touched if touch else collided):
-                    continue
-                offset = minus(center, triple(middles, world, box))
-                if _is_apart(offset, radius, axes, sizes, reaches, world, box):
-                    continue
-                for i in range(3):
-                    axis = (axes[world, box, 0, i], axes[world, box, 1, i], axes[world, box, 2, i])
-                    room.offset[i] = dot(axis, offset)
-                    for j in range(3):
-                        room.turn[i, j] = dot(axis, column_in_world(frames, link, poses, shape, j))
-                if robot.is_cylinder[shape]:
-                    meet = cylinder_meets_box(half[shape], sizes[world, box], room)
-                else:
-                    meet = boxes_meet(half[shape], sizes[world, box], room)
-                touched, collided = touched or (meet and touch), collided or (meet and not touch)
+            if touched and collided:
+                return True, True
+    if legs == 0:
+        _begin_pose(paths, row, room)
+    touched, collided, _ = _look(
+        robot, worlds, world, 1.0, resolution, touched, collided, room, pair
+    )
     return touched, collided
 
 
-@kernel()
-def _leaves_room(low: Floats, high: Floats, world: int, center: Vector, radius: float) -> bool:
-    """Whether a ball stays away from all boxes, by the room they take along the world's axes."""
-    return (
-        center[0] + radius < low[world, 0]
-        or center[0] - radius > high[world, 0]
-        or center[1] + radius < low[world, 1]
-        or center[1] - radius > high[world, 1]
-        or center[2] + radius < low[world, 2]
-        or center[2] - radius > high[world, 2]
-    )
+@kernel(counts=False)
+def _legs_that_count(paths: Floats, row: int) -> int:
+    """How many legs there are to the end of the last one that moves."""
+    for knot in range(paths.shape[1] - 1, 0, -1):
+        for joint in range(paths.shape[2]):
+            if paths[row, knot, joint] != paths[row, knot - 1, joint]:
+                return (knot + 1) // 2
+    return 0
 
 
-@kernel()
-def _is_apart(
-    offset: Vector,
-    radius: float,
+@kernel(counts=False)
+def _begin_pose(paths: Floats, row: int, room: Room) -> None:
+    """Takes the last knot for a leg on which nothing moves."""
+    room.leg[:], room.bends[:], room.idle[:] = 0.0, 0.0, False
+    for joint in range(paths.shape[2]):
+        room.leg[0, joint] = paths[row, -1, joint]
+
+
+@kernel(counts=False)
+def _begin_leg(paths: Floats, row: int, number: int, reach: Floats, room: Room) -> bool:
+    """Writes a leg as q = leg[0] + leg[1] t + leg[2] t^2 / 2, and the shapes' accelerations.
+
+    Returns whether anything moves on it.
+    """
+    leg, bends, first, moves = room.leg, room.bends, 2 * number, False
+    room.idle[:] = False
+    for joint in range(paths.shape[2]):
+        start, middle, end = (
+            paths[row, first, joint],
+            paths[row, first + 1, joint],
+            paths[row, first + 2, joint],
+        )
+        leg[0, joint] = start
+        leg[1, joint] = 4.0 * middle - 3.0 * start - end
+        leg[2, joint] = 4.0 * (start + end - 2.0 * middle)
+        moves = moves or middle != start or end != start
+    for shape in range(len(bends)):
+        before = bend = 0.0
+        for joint in range(paths.shape[2]):
+            # The speed is linear in time, and largest at an end.
+            speed = max(abs(leg[1, joint]), abs(leg[1, joint] + leg[2, joint]))
+            turns = speed * (speed + 2.0 * before) + abs(leg[2, joint])
+            bend += reach[shape, joint] * turns
+            before += speed
+        bends[shape] = bend
+    return moves
+
+
+@kernel(counts=False)
+def _look(
+    robot: RobotArrays,
+    worlds: WorldArrays,
+    world: int,
+    part: float,
+    resolution: float,
+    touched: bool,
+    collided: bool,
+    room: Room,
+    pair: Pair,
+) -> tuple[bool, bool, float]:
+    """Looks at a part of a leg.
+
+    Returns what was touched so far, and the part at which to look next.
+    """
+    links, poses, radii, idle = robot.shape_links, robot.shape_poses, robot.shape_radius, room.idle
+    frames, left = room.frames, 1.0 - part
+    step = left
+    if idle.all():
+        return touched, collided, 1.0
+    _stand(robot, part, room)
+    # The tool comes first: it is the nearest mostly, and then others need not be told apart.
+    for shape in range(len(links) - 1, -1, -1):
+        if idle[shape]:
+            continue
+        radius, link, bend = radii[shape], links[shape], room.bends[shape]
+        center = in_world(frames, link, poses[shape, 0, 3], poses[shape, 1, 3], poses[shape, 2, 3])
+        speed = _largest_speed(frames, room.turns, room.drifts, link, center, radius)
+        clear = _beyond(worlds.low, worlds.high, world, center) - radius
+        done = collided and (touched or not robot.is_cup[shape])
+        idle[shape] = done or clear > left * (speed + left * bend / 2.0)
+        far = step * (speed + step * bend / 2.0)
+        if idle[shape] or clear > far:
+            continue
+        clear, touched, collided = _nearest(
+            robot, worlds, world, shape, center, far, touched, collided, frames, pair
+        )
+        if clear < far:
+            # v t + A t^2 / 2 = distance
+            distance = max(clear, resolution)
+            root = math.sqrt(speed * speed + 2.0 * bend * distance)
+            step = min(step, 2.0 * distance / (speed + root))
+    return touched, collided, part + step if step < left else 1.0
+
+
+@kernel(counts=False)
+def _nearest(
+    robot: RobotArrays,
+    worlds: WorldArrays,
+    world: int,
+    shape: int,
+    center: Vector,
+    far: float,
+    touched: bool,
+    collided: bool,
+    frames: Floats,
+    pair: Pair,
+) -> tuple[float, bool, bool]:
+    """The distance of a shape to what it does not touch yet, `far` at most, and what it touches.
+
+    Boxes that would change nothing any more are left out.
+    """
+    radius, link, half = robot.shape_radius[shape], robot.shape_links[shape], robot.shape_half
+    is_cylinder, is_cup = robot.is_cylinder[shape], robot.is_cup[shape]
+    axes, sizes, clear = worlds.axes, worlds.half, far
+    for box in range(sizes.shape[1]):
+        touch = is_cup and worlds.is_target[world, box]
+        reach = worlds.radius[world, box]
+        if reach == 0.0 or (touched if touch else collided):
+            continue
+        offset = minus(center, triple(worlds.center, world, box))
+        within = radius + clear
+        if dot(offset, offset) > (reach + within) * (reach + within):
+            continue
+        square = _see(offset, axes, sizes, world, box, pair.offset)
+        if square > within * within:
+            continue
+        apart = math.sqrt(square) - radius
+        if apart > radius:
+            clear = apart
+            continue
+        _turn(frames, link, robot.shape_poses, shape, axes, world, box, pair.turn)
+        gap = max(gap_between(is_cylinder, half[shape], sizes[world, box], pair), apart)
+        if gap <= 0.0 and meets(is_cylinder, half[shape], sizes[world, box], pair):
+            touched, collided = touched or touch, collided or not touch
+        else:
+            clear = min(clear, max(gap, 0.0))
+    return clear, touched, collided
+
+
+@kernel(counts=False)
+def _turn(
+    frames: Floats,
+    link: int,
+    poses: Floats,
+    shape: int,
     axes: Floats,
-    sizes: Floats,
-    reaches: Floats,
     world: int,
     box: int,
-) -> bool:
-    """Whether a ball meets neither the ball about a box nor the box, at `offset` from it."""
-    reach = radius + reaches[world, box]
-    if dot(offset, offset) > reach * reach:
-        return True
-    apart = 0.0
+    turn: Floats,
+) -> None:
+    """Writes the axes of a link's shape (3, 3), as columns, in a box's frame."""
+    for j in range(3):
+        direction = column_in_world(frames, link, poses, shape, j)
+        for i in range(3):
+            axis = (axes[world, box, 0, i], axes[world, box, 1, i], axes[world, box, 2, i])
+            turn[i, j] = dot(axis, direction)
+
+
+@kernel(counts=False)
+def _stand(robot: RobotArrays, part: float, room: Room) -> None:
+    """Moves the links to where they are at a part of the leg, and finds their velocities."""
+    leg, frames, turns, drifts = room.leg, room.frames, room.turns, room.drifts
+    for joint in range(len(room.speeds)):
+        room.speeds[joint] = leg[1, joint] + part * leg[2, joint]
+        room.pose[0, 0, joint] = leg[0, joint] + part * (leg[1, joint] + part * leg[2, joint] / 2.0)
+    move_links(robot.parents, robot.joints, robot.origins, robot.axes, room.pose, 0, 0, frames)
+    for link in range(len(robot.parents)):
+        parent, joint = robot.parents[link], robot.joints[link]
+        if parent < 0:
+            continue
+        turn = (turns[parent, 0], turns[parent, 1], turns[parent, 2])
+        offset = (
+            frames[link, 0, 3] - frames[parent, 0, 3],
+            frames[link, 1, 3] - frames[parent, 1, 3],
+            frames[link, 2, 3] - frames[parent, 2, 3],
+        )
+        sweep = cross(turn, offset)
+        for i in range(3):
+            drifts[link, i] = drifts[parent, i] + sweep[i]
+            turns[link, i] = turn[i]
+            if joint >= 0:
+                for k in range(3):
+                    axis = frames[link, i, k] * robot.axes[joint, k]
+                    turns[link, i] += axis * room.speeds[joint]
+
+
+@kernel(counts=False)
+def _largest_speed(
+    frames: Floats, turns: Floats, drifts: Floats, link: int, center: Vector, radius: float
+) -> float:
+    """The largest speed of a point of a ball that moves with a link."""
+    turn = (turns[link, 0], turns[link, 1], turns[link, 2])
+    offset = (
+        center[0] - frames[link, 0, 3],
+        center[1] - frames[link, 1, 3],
+        center[2] - frames[link, 2, 3],
+    )
+    sweep = cross(turn, offset)
+    velocity = (
+        drifts[link, 0] + sweep[0],
+        drifts[link, 1] + sweep[1],
+        drifts[link, 2] + sweep[2],
+    )
+    return math.sqrt(dot(velocity, velocity)) + radius * math.sqrt(dot(turn, turn))
+
+
+@kernel(counts=False)
+def _beyond(low: Floats, high: Floats, world: int, point: Vector) -> float:
+    """The distance of a point to the room that all boxes take along the world's axes."""
+    square = 0.0
+    for i in range(3):
+        beyond = max(0.0, low[world, i] - point[i], point[i] - high[world, i])
+        square += beyond * beyond
+    return math.sqrt(square)
+
+
+@kernel(counts=False)
+def _see(offset: Vector, axes: Floats, sizes: Floats, world: int, box: int, local: Floats) -> float:
+    """Writes an offset (3,) from a box in the box's frame; returns its squared distance."""
+    square = 0.0
     for k in range(3):
         axis = (axes[world, box, 0, k], axes[world, box, 1, k], axes[world, box, 2, k])
-        beyond = max(0.0, abs(dot(axis, offset)) - sizes[world, box, k])
-        apart += beyond * beyond
-    return apart > radius * radius
-
-
-@kernel()
-def boxes_meet(half: Floats, box_half: Floats, room: Room) -> bool:
-    """Whether two boxes have a point in common, by their 15 possible separating axes.
-
-    Source: Gottschalk, Lin and Manocha, "OBBTree", SIGGRAPH 1996.
-    """
-    turn, size, offset = room.turn, room.size, room.offset
-    for i in range(3):
-        reach = box_half[i]
-        for j in range(3):
-            size[i, j] = abs(turn[i, j]) + PARALLEL_EDGES
-            reach += half[j] * abs(turn[i, j])
-        if abs(offset[i]) > reach:
-            return False
-    for j in range(3):
-        reach, along = half[j], 0.0
-        for i in range(3):
-            reach += box_half[i] * abs(turn[i, j])
-            along += offset[i] * turn[i, j]
-        if abs(along) > reach:
-            return False
-    for i in range(3):
-        i1, i2 = (i + 1) % 3, (i + 2) % 3
-        for j in range(3):
-            j1, j2 = (j + 1) % 3, (j + 2) % 3
-            reach = (
-                box_half[i1] * size[i2, j]
-                + box_half[i2] * size[i1, j]
-                + half[j1] * size[i, j2]
-                + half[j2] * size[i, j1]
-            )
-            if abs(offset[i2] * turn[i1, j] - offset[i1] * turn[i2, j]) > reach:
-                return False
-    return True
-
-
-@kernel()
-def cylinder_meets_box(half: Floats, box_half: Floats, room: Room) -> bool:
-    """Whether a cylinder and a box have a point in common.
-
-    What of the box lies between the cylinder's ends is a polytope whose corners lie on the box's
-    edges. Seen along the cylinder's axis it is the hull of those corners, which meets the cylinder
-    where it comes within the radius of the axis.
-    """
-    radius, half_length, count = half[0], half[2], 0
-    for edge in range(BOX_EDGES):
-        first = _edge_end(edge, -1.0, box_half, room)
-        second = _edge_end(edge, 1.0, box_half, room)
-        begin, end, rise = 0.0, 1.0, second[2] - first[2]
-        if rise < 0.0:
-            first, second, rise = second, first, -rise
-        if first[2] > half_length or second[2] < -half_length:
-            continue
-        if first[2] < -half_length:
-            begin = (-half_length - first[2]) / rise
-        if second[2] > half_length:
-            end = (half_length - first[2]) / rise
-        for part in (begin, end):
-            room.points[count, 0] = first[0] + part * (second[0] - first[0])
-            room.points[count, 1] = first[1] + part * (second[1] - first[1])
-            count += 1
-    return count > 0 and _hull_comes_within(radius, room.points, count)
-
-
-@kernel()
-def _edge_end(edge: int, side: float, box_half: Floats, room: Room) -> tuple[float, float, float]:
-    """An end of one of the 12 edges of the box, in the cylinder's frame."""
-    k = edge // 4
-    i, j = (k + 1) % 3, (k + 2) % 3
-    along = side * box_half[k] - room.offset[k]
-    across = (box_half[i] if edge & 1 else -box_half[i]) - room.offset[i]
-    up = (box_half[j] if edge & 2 else -box_half[j]) - room.offset[j]
-    turn = room.turn
-    return (
-        turn[k, 0] * along + turn[i, 0] * across + turn[j, 0] * up,
-        turn[k, 1] * along + turn[i, 1] * across + turn[j, 1] * up,
-        turn[k, 2] * along + turn[i, 2] * across + turn[j, 2] * up,
-    )
-
-
-@kernel()
-def _hull_comes_within(radius: float, points: Floats, count: int) -> bool:
-    """Whether the convex hull of points (count, 2) comes within `radius` of the origin.
-
-    Gilbert, Johnson and Keerthi, "A fast procedure for computing the distance between complex
-    objects in three-dimensional space", 1988, in two dimensions.
-    """
-    a = b = v = (points[0, 0], points[0, 1])
-    for _ in range(MAX_ITERATIONS):
-        square = v[0] * v[0] + v[1] * v[1]
-        if square <= radius * radius:
-            return True
-        s, least = v, square
-        for i in range(count):
-            product = v[0] * points[i, 0] + v[1] * points[i, 1]
-            if product < least:
-                s, least = (points[i, 0], points[i, 1]), product
-        # No point of the hull is nearer than its foremost plane, nor farther than v.
-        if least > radius * np.sqrt(square) or square - least <= CONVERGED_M2:
-            return False
-        if _triangle_holds_origin(a, b, s):
-            return True
-        with_a, with_b = _nearest_on_segment(a, s), _nearest_on_segment(b, s)
-        if with_a[0] ** 2 + with_a[1] ** 2 <= with_b[0] ** 2 + with_b[1] ** 2:
-            b, v = s, with_a
-        else:
-            a, v = s, with_b
-    return False
-
-
-@kernel()
-def _nearest_on_segment(a: tuple[float, float], b: tuple[float, float]) -> tuple[float, float]:
-    """The point nearest to the origin between two points."""
-    x, y = b[0] - a[0], b[1] - a[1]
-    square = x * x + y * y
-    part = 0.0 if square == 0.0 else min(1.0, max(0.0, -(a[0] * x + a[1] * y) / square))
-    return a[0] + part * x, a[1] + part * y
-
-
-@kernel()
-def _triangle_holds_origin(
-    a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]
-) -> bool:
-    """Whether the origin lies inside a triangle of any orientation."""
-    ab = a[0] * b[1] - a[1] * b[0]
-    bc = b[0] * c[1] - b[1] * c[0]
-    ca = c[0] * a[1] - c[1] * a[0]
-    return (ab > 0.0 and bc > 0.0 and ca > 0.0) or (ab < 0.0 and bc < 0.0 and ca < 0.0)
+        local[k] = dot(axis, offset)
+        beyond = max(0.0, abs(local[k]) - sizes[world, box, k])
+        square += beyond * beyond
+    return square

@@ -16,21 +16,23 @@ Bools = NDArray[np.bool_]
 Vector = tuple[float, float, float]
 
 
-def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def kernel(*, counts: bool = True, **options: Any) -> Callable[..., Callable[..., Any]]:
     """A decorator that compiles a function at its first call, and keeps that for the next process.
 
     A division by zero is infinite, not an exception, which would be a branch in every loop. What is
     kept of a kernel is renewed when its own file changes, but not when a file it imports from does.
 
     Every array that is sliced or given to a function costs two atomic additions, to its counter of
-    references, and a tuple of arrays as many as it has: inner loops are given single arrays only.
+    references, and a tuple of arrays as many as it has: inner loops are given single arrays only,
+    or do not count.
 
     Args:
+        counts: references to arrays. A function that does not can make no arrays, and is called by
+            functions that hold the arrays it is given.
         options: more of `numba.njit`'s.
     """
-    decorator: Callable[[Callable[..., Any]], Callable[..., Any]] = njit(
-        cache=True, error_model="numpy", **options
-    )
+    options = {"cache": True, "error_model": "numpy", "_nrt": counts, **options}
+    decorator: Callable[[Callable[..., Any]], Callable[..., Any]] = njit(**options)
     return decorator
 
 
@@ -45,6 +47,7 @@ class RobotArrays(NamedTuple):
         shape_poses: (S, 4, 4) in the frames of the links.
         shape_half: (S, 3) half extents; of a cylinder the radius twice and half the length.
         shape_radius: (S,) of the ball about the shape.
+        shape_reach: (S, J) see `envs.grasp.robot.kinematics.shape_reach`.
         is_cylinder, is_cup: (S,).
         shape_colors: (S, 3) in [0, 255].
     """
@@ -57,6 +60,7 @@ class RobotArrays(NamedTuple):
     shape_poses: Floats
     shape_half: Floats
     shape_radius: Floats
+    shape_reach: Floats
     is_cylinder: Bools
     is_cup: Bools
     shape_colors: Floats
@@ -92,19 +96,29 @@ class WorldArrays(NamedTuple):
     joints: Floats
 
 
-@kernel()
+@kernel(counts=False)
 def dot(first: Vector, second: Vector) -> float:
     """The inner product."""
     return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
-@kernel()
+@kernel(counts=False)
 def minus(first: Vector, second: Vector) -> Vector:
     """The difference."""
     return first[0] - second[0], first[1] - second[1], first[2] - second[2]
 
 
-@kernel()
+@kernel(counts=False)
+def cross(first: Vector, second: Vector) -> Vector:
+    """The cross product."""
+    return (
+        first[1] * second[2] - first[2] * second[1],
+        first[2] * second[0] - first[0] * second[2],
+        first[0] * second[1] - first[1] * second[0],
+    )
+
+
+@kernel(counts=False)
 def move_links(
     parents: Integers,
     joints: Integers,
@@ -138,7 +152,7 @@ def move_links(
             _turn(frames, link, axis, paths[row, pose, joint])
 
 
-@kernel()
+@kernel(counts=False)
 def _turn(frames: Floats, link: int, axis: Vector, angle: float) -> None:
     """Turns a frame about one of its own directions, by Rodrigues' formula for each of its rows."""
     x, y, z = axis
@@ -152,7 +166,7 @@ def _turn(frames: Floats, link: int, axis: Vector, angle: float) -> None:
         frames[link, i, 2] = c * cosine + (a * y - b * x) * sine + z * along
 
 
-@kernel()
+@kernel(counts=False)
 def in_world(frames: Floats, link: int, x: float, y: float, z: float) -> Vector:
     """A point of a link, in the world."""
     return (
@@ -171,7 +185,7 @@ def in_world(frames: Floats, link: int, x: float, y: float, z: float) -> Vector:
     )
 
 
-@kernel()
+@kernel(counts=False)
 def column_in_world(frames: Floats, link: int, poses: Floats, shape: int, k: int) -> Vector:
     """Column `k` of one of the `poses` (S, 4, 4) of a link's shapes, a direction, in the world."""
     x, y, z = poses[shape, 0, k], poses[shape, 1, k], poses[shape, 2, k]
@@ -182,7 +196,7 @@ def column_in_world(frames: Floats, link: int, poses: Floats, shape: int, k: int
     )
 
 
-@kernel()
+@kernel(counts=False)
 def triple(values: Floats, i: int, j: int) -> Vector:
     """The three numbers values[i, j]."""
     return values[i, j, 0], values[i, j, 1], values[i, j, 2]

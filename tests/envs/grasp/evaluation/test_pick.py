@@ -10,18 +10,20 @@ import pytest
 
 from envs.grasp.env import make_vector_env
 from envs.grasp.evaluation.pick import Attempt, Outcome, Picker
+from envs.grasp.robot.arm import Arm
 from envs.grasp.robot.urdf import load_robot
 from envs.grasp.scene.sampler import Scenes, SceneSampler, heading
 from envs.grasp.settings import GraspSettings, Pick, Randomize, Support
 
 BuildScene = Callable[..., Scenes]
 GAP_M = 0.015
+ARM = Arm.of(GraspSettings(), load_robot())
 BOX = ((1.0, 0.0), 0.0, (0.1, 0.16, 0.2))
 
 
 @pytest.fixture(scope="module")
 def picker() -> Iterator[Picker]:
-    made = Picker(load_robot(), Support(), Pick())
+    made = Picker(ARM, Support(), Pick())
     yield made
     made.close()
 
@@ -113,7 +115,7 @@ def test_a_block_heavier_than_the_cup_holds_is_dropped(
     # 0.5 * 60 kPa * pi * (0.03 m)^2 = 84.8 N, and at most 1.2 m/s^2 upwards: 7.7 kg.
     # The block has 6.9 litres.
     scene = box_scene([((1.05, 0.0), 0.0, (0.12, 0.24, 0.24))])
-    picker = Picker(load_robot(), Support(), Pick(density_kg_m3=density))
+    picker = Picker(ARM, Support(), Pick(density_kg_m3=density))
     try:
         assert picker.pick(scene, *aim(scene)) == outcome
     finally:

@@ -17,7 +17,7 @@ from envs.grasp.evaluation.film import film
 from envs.grasp.evaluation.plots import AIM_COLOR, contact_sheet
 from envs.grasp.scene.sampler import heading
 from envs.grasp.sensors.camera import project
-from envs.grasp.settings import Camera, Pick, Support
+from envs.grasp.settings import Camera, GraspSettings
 from envs.grasp.vector_env import GraspVectorEnv
 
 SHOWN, ENVS = 7, 8
@@ -81,7 +81,7 @@ def test_the_film_goes_on_to_the_pick_only_where_there_is_one(env: GraspVectorEn
     for found in ({}, outcomes(success=ENVS)):
         report = env.evaluator().pictures()
         report.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), found)
-        content = film(report._shots[:1], Support(), Pick(), bool(found))
+        content = film(report._shots[:1], GraspSettings(), bool(found))
         with Image.open(io.BytesIO(content)) as image:
             assert image.info["loop"] == 0
             lengths_ms.append(0)

@@ -13,11 +13,10 @@ from envs.grasp.robot.kinematics import (
     InverseKinematics,
     forward,
     grasp_pose,
-    joint_path,
-    motion_duration_s,
+    shape_reach,
     tooltip_pose,
 )
-from envs.grasp.robot.urdf import KR16_URDF, load_robot
+from envs.grasp.robot.urdf import KR16_URDF, Box, load_robot
 
 # Tooltip x, y, z (m) and yaw (deg). Nearer than x = 0.81 m, A3 would have to fold beyond 154 deg.
 LOWER = (0.81, -0.45, 0.6, -40.0)
@@ -227,21 +226,31 @@ def test_closed_form_refuses_another_build() -> None:
         InverseKinematics(other)
 
 
-def test_joint_path_is_even_and_ends_exactly() -> None:
-    start, end = np.zeros((2, 6)), np.array([[1.0] * 6, [-0.3] * 6])
-    path = joint_path(start, end, 4)
-    np.testing.assert_allclose(path[0, :, 0], [0.25, 0.5, 0.75, 1.0])
-    np.testing.assert_array_equal(path[:, -1], end)
-    np.testing.assert_array_equal(joint_path(end, start, 1)[:, 0], start)
-    with pytest.raises(ValueError, match="at least 1"):
-        joint_path(start, end, 0)
-
-
-def test_slowest_joint_sets_the_duration() -> None:
-    start = np.zeros((3, 6))
-    # 78 deg of A1 at 156 deg/s; A6 needs less for 123 deg at 615 deg/s; 66 deg of A5 at 330 deg/s
-    end = np.deg2rad([[-78, 0, 0, 0, 0, 123], [0, 0, 0, 0, 66, 0], [0, 0, 0, 0, 0, 0]])
-    np.testing.assert_allclose(motion_duration_s(ROBOT, start, end), [0.5, 0.2, 0.0])
+def test_no_turn_moves_a_point_of_a_shape_further_than_its_reach() -> None:
+    reach, rng = shape_reach(ROBOT), np.random.default_rng(0)
+    joints = rng.uniform(-np.pi, np.pi, (3000, 6))
+    shapes = [(link, s) for link, some in enumerate(ROBOT.link_primitives) for s in some]
+    assert reach.shape == (len(shapes), 6)
+    frames = forward(ROBOT, joints)
+    for row, (link, shape) in enumerate(shapes):
+        is_box = isinstance(shape, Box)
+        half = shape.half_extents_m if is_box else [shape.radius_m, 0, shape.length_m / 2]
+        corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T * half
+        points = corners @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+        world = points @ np.swapaxes(frames[:, link, :3, :3], 1, 2) + frames[:, link, None, :3, 3]
+        for joint in range(6):
+            mover = ROBOT.link_joints.index(joint)
+            if mover > link:
+                assert reach[row, joint] == 0.0
+                continue
+            origin = frames[:, mover, None, :3, 3]
+            axis = frames[:, mover, :3, :3] @ ROBOT.joint_axes[joint]
+            lever = np.linalg.norm(np.cross(axis[:, None], world - origin), axis=-1)
+            assert lever.max() <= reach[row, joint] + 1e-9
+    # The base does not move; the cup's farthest point from A1, by the lengths of the links.
+    np.testing.assert_array_equal(reach[:2], 0.0)
+    further = 0.26 + 0.68 + np.hypot(0.67, 0.035) + (0.158 + 0.09 + 0.015) + np.hypot(0.03, 0.015)
+    assert reach[-1, 0] == pytest.approx(further)
 
 
 def test_way_home_does_not_flip_the_wrist() -> None:

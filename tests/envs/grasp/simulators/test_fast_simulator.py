@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from worlds import FIRST, ROBOT, fixed_views, home, pose, reaching, sampled
+from worlds import FIRST, RESOLUTION_M, ROBOT, fixed_views, home, pose, reaching, sampled
 
 from benchmarks.agreement import compare, difference, off_edges
 from encoders.spaces import DepthImage
 from envs.grasp.env import make_vector_env
 from envs.grasp.robot.kinematics import forward
+from envs.grasp.robot.paths import straight_leg
 from envs.grasp.robot.urdf import Box
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses, focal_length_px, sample_views
@@ -23,7 +24,12 @@ from envs.grasp.sensors.noise import fill_normals
 from envs.grasp.settings import Camera, GraspSettings, Support
 from envs.grasp.simulators.factory import make_simulator
 from envs.grasp.simulators.fast import FastSimulator
-from envs.grasp.simulators.kernels.contacts import Room, boxes_meet, cylinder_meets_box
+from envs.grasp.simulators.kernels.pairs import (
+    boxes_meet,
+    cylinder_meets_box,
+    gap_between,
+    make_pair,
+)
 from envs.grasp.simulators.pybullet import PyBulletSimulator
 from envs.grasp.simulators.thread_pool import ThreadPool
 from envs.grasp.threefry import threefry
@@ -64,7 +70,7 @@ def test_pictures_of_any_size_agree(width: int, height: int) -> None:
     path, fast, exact = reaching(scenes), loaded(scenes), PyBulletSimulator(count, ROBOT, Support())
     exact.load(everyone, scenes, home(count))
     for simulator in (fast, exact):
-        simulator.move(everyone, path)
+        simulator.move(everyone, path, RESOLUTION_M)
     depths, colors = (
         [s.render(everyone, fixed_views(camera, count)) for s in (exact, fast)]
         for camera in cameras.values()
@@ -157,7 +163,7 @@ def test_a_seen_point_lies_on_a_surface_and_nothing_lies_before_it(seed: int) ->
     camera = Camera(type="depth", width=61, height=47, near_m=(0.02, 0.02), far_m=(9.0, 9.0))
     scenes, _ = sampled(1, seed)
     path, simulator = reaching(scenes, seed), loaded(scenes)
-    simulator.move(FIRST, path)
+    simulator.move(FIRST, path, RESOLUTION_M)
     near_tool = scenes.target_m[0] + [-0.2, (0.3, 0.15, 0.2)[seed], 0.1 + 0.1 * seed]
     camera = camera.model_copy(
         update={"position_m": tuple(near_tool), "target_m": tuple(scenes.target_m[0])}
@@ -321,15 +327,15 @@ def test_contacts_of_a_pose(
 ) -> None:
     target = ((1.10, 0.0), 0.0, (0.1, 0.2, 0.2))
     aside = ((1.25, -0.38), 0.0, (0.1, 0.15, 0.15))
-    contacts = loaded(box_scene([target, aside])).move(FIRST, pose(*tooltip, yaw))
+    contacts = loaded(box_scene([target, aside])).move(FIRST, pose(*tooltip, yaw), RESOLUTION_M)
     assert (contacts.touched[0], contacts.collided[0]) == (touched, collided)
 
 
 def test_contacts_are_those_of_all_poses_and_of_this_motion_only(box_scene: SceneBuilder) -> None:
     simulator = loaded(box_scene([((1.10, 0.0), 0.0, (0.1, 0.2, 0.2)), ASIDE]))
     free, touching = pose(1.0, 0.0, 0.8), pose(1.102, 0.0, 0.70)
-    assert simulator.move(FIRST, np.concatenate([touching, free], axis=1)).touched[0]
-    assert not simulator.move(FIRST, free).touched[0]
+    assert simulator.move(FIRST, straight_leg(touching[:, 0], free[:, 0]), RESOLUTION_M).touched[0]
+    assert not simulator.move(FIRST, free, RESOLUTION_M).touched[0]
 
 
 def turned(rng: np.random.Generator) -> np.ndarray:
@@ -367,11 +373,11 @@ def test_shapes_meet_where_their_distance_vanishes(is_cylinder: bool) -> None:
                 local = np.clip(local, -half, half)
             return offset + turn @ local
 
-        room = Room(
-            np.zeros((1, 3, 4)), offset.copy(), turn.copy(), np.zeros((3, 3)), np.zeros((24, 2))
-        )
-        meet = (cylinder_meets_box if is_cylinder else boxes_meet)(half, box_half, room)
+        pair = make_pair()
+        pair.offset[:], pair.turn[:] = offset, turn
+        meet = (cylinder_meets_box if is_cylinder else boxes_meet)(half, box_half, pair)
         distance = gap(project, box_half)
+        assert gap_between(is_cylinder, half, box_half, pair) <= distance + 1e-4
         assert meet == (distance < 1e-5) or 1e-5 < distance < 1e-4
         answers.append(meet)
     assert 10 < sum(answers) < 50
@@ -382,7 +388,7 @@ def test_shapes_meet_where_their_distance_vanishes(is_cylinder: bool) -> None:
 
 def everything(simulator: FastSimulator, scenes: Scenes, views: dict[str, CameraPoses]) -> list:
     index, seeds = np.arange(len(scenes)), np.arange(len(scenes)).astype(np.uint64)
-    contacts = simulator.move(index, reaching(scenes))
+    contacts = simulator.move(index, reaching(scenes), RESOLUTION_M)
     return [
         contacts.touched,
         contacts.collided,
@@ -406,7 +412,8 @@ def test_results_do_not_depend_on_threads_nor_on_the_company() -> None:
     again = everything(loaded(scenes), scenes, views)
     for i in (0, 5, 8):
         alone = loaded(scenes[i : i + 1])
-        assert alone.move(FIRST, reaching(scenes)[i : i + 1]).touched[0] == results[0][i]
+        contacts = alone.move(FIRST, reaching(scenes)[i : i + 1], RESOLUTION_M)
+        assert contacts.touched[0] == results[0][i]
         np.testing.assert_array_equal(alone.render(FIRST, views["rgb"][i : i + 1])[0], again[3][i])
 
 
@@ -443,7 +450,7 @@ def test_a_thousand_worlds() -> None:
     few, views = sampled(8, 0, depth=Camera(type="depth", width=16, height=16))
     many = few[np.tile(np.arange(8), 128)]
     simulator, index = loaded(many), np.arange(1024)
-    contacts = simulator.move(index, np.tile(reaching(few), (128, 1, 1)))
+    contacts = simulator.move(index, np.tile(reaching(few), (128, 1, 1)), RESOLUTION_M)
     depth = simulator.render(index, views["depth"][np.tile(np.arange(8), 128)])
     np.testing.assert_array_equal(depth, np.tile(depth[:8], (128, 1, 1)))
     np.testing.assert_array_equal(contacts.touched, np.tile(contacts.touched[:8], 128))
@@ -489,11 +496,11 @@ def test_bad_input_is_refused_with_its_name() -> None:
     with pytest.raises(ValueError, match=r"joints_rad.*finite"):
         simulator.load(both, scenes, home(2) * np.nan)
     with pytest.raises(ValueError, match=r"path_rad.*finite"):
-        simulator.move(both, path * [1, 1, 1, 1, 1, np.inf])
-    with pytest.raises(ValueError, match="p at least 1"):
-        simulator.move(both, path[:, :0])
+        simulator.move(both, path * [1, 1, 1, 1, 1, np.inf], RESOLUTION_M)
+    with pytest.raises(ValueError, match=r"2 k \+ 1 knots"):
+        simulator.move(both, path[:, :0], RESOLUTION_M)
     with pytest.raises(ValueError, match=r"path_rad.*shape"):
-        simulator.move(both, path[:, :, :5])
+        simulator.move(both, path[:, :, :5], RESOLUTION_M)
     with pytest.raises(ValueError, match=r"position_m of the views.*finite"):
         simulator.render(both, spoilt(view, "position_m", np.nan))
     with pytest.raises(ValueError, match=r"rotation of the views.*orthonormal"):
@@ -510,11 +517,11 @@ def test_bad_input_is_refused_with_its_name() -> None:
         simulator.render_depth(both, view, DepthImage(80, 80), seeds[:1])
     for wrong in ([0, 2], [1, 0], [0, 0], [-1, 0]):
         with pytest.raises(ValueError, match="indices must rise"):
-            simulator.move(np.array(wrong), path)
+            simulator.move(np.array(wrong), path, RESOLUTION_M)
     fresh = FastSimulator(2, ROBOT, Support())
     fresh.load(FIRST, scenes[:1], home(1))
     with pytest.raises(ValueError, match=r"worlds \[1\] hold no scene"):
-        fresh.move(both, path)
+        fresh.move(both, path, RESOLUTION_M)
     with pytest.raises(ValueError, match="0 threads"):
         FastSimulator(2, ROBOT, Support(), threads=0)
 
@@ -562,7 +569,7 @@ def test_an_environment_pays_what_pybullets_does() -> None:
 
 def test_a_second_start_compiles_nothing() -> None:
     """What this process has compiled or found is what the next one finds."""
-    loaded(sampled(1)[0]).move(FIRST, pose(1.0, 0.0, 0.8))
+    loaded(sampled(1)[0]).move(FIRST, pose(1.0, 0.0, 0.8), RESOLUTION_M)
     code = (
         "import numpy as np\n"
         "from envs.grasp.robot.urdf import load_robot\n"
@@ -574,7 +581,7 @@ def test_a_second_start_compiles_nothing() -> None:
         "robot = load_robot()\n"
         "simulator, home = FastSimulator(1, robot, Support()), robot.home_rad[None]\n"
         "simulator.load(np.array([0]), scenes, home)\n"
-        "simulator.move(np.array([0]), home[:, None])\n"
+        "simulator.move(np.array([0]), home[:, None], 0.005)\n"
         "print(sum(touch_along.stats.cache_misses.values()))\n"
     )
     run = subprocess.run(

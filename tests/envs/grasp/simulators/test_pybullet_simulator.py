@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pybullet
 import pytest
-from worlds import FIRST, ROBOT, fixed_views, home, pose, reaching, sampled
+from worlds import FIRST, RESOLUTION_M, ROBOT, fixed_views, home, pose, reaching, sampled
 
 from encoders.spaces import DepthImage
-from envs.grasp.robot.arm import Arm, Tools
+from envs.grasp.robot.paths import straight_leg
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses, focal_length_px, sample_views
 from envs.grasp.sensors.depth import sense_depth
-from envs.grasp.settings import Camera, GraspSettings, Support, Workspace
+from envs.grasp.settings import Camera, GraspSettings, Support
 from envs.grasp.simulators import pybullet as pybullet_module
 from envs.grasp.simulators.factory import make_simulator
 from envs.grasp.simulators.pybullet import PyBulletSimulator
@@ -263,7 +263,7 @@ def test_contacts_of_a_pose(
 ) -> None:
     target = ((1.10, 0.0), 0.0, (0.1, 0.2, 0.2))
     aside = ((1.25, -0.38), 0.0, (0.1, 0.15, 0.15))
-    contacts = simulate(box_scene([target, aside])).move(FIRST, pose(*tooltip, yaw))
+    contacts = simulate(box_scene([target, aside])).move(FIRST, pose(*tooltip, yaw), RESOLUTION_M)
     assert (contacts.touched[0], contacts.collided[0]) == (touched, collided)
 
 
@@ -271,7 +271,7 @@ def test_touching_and_colliding_at_once(
     simulate: Callable[[Scenes], PyBulletSimulator], box_scene: SceneBuilder
 ) -> None:
     scene = box_scene([((1.10, 0.0), 0.0, (0.1, 0.2, 0.2)), ASIDE])
-    contacts = simulate(scene).move(FIRST, pose(1.102, 0.0, 0.625))
+    contacts = simulate(scene).move(FIRST, pose(1.102, 0.0, 0.625), RESOLUTION_M)
     assert contacts.touched[0]
     assert contacts.collided[0]
 
@@ -281,7 +281,7 @@ def test_a_link_of_the_arm_collides_with_the_target_too(
 ) -> None:
     # The cup is past a low target, over which the wrist lies.
     scene = box_scene([((0.90, 0.0), 0.0, (0.08, 0.12, 0.12)), ASIDE])
-    contacts = simulate(scene).move(FIRST, pose(1.10, 0.0, 0.72))
+    contacts = simulate(scene).move(FIRST, pose(1.10, 0.0, 0.72), RESOLUTION_M)
     assert not contacts.touched[0]
     assert contacts.collided[0]
 
@@ -292,26 +292,22 @@ def test_contacts_of_a_path_are_those_of_all_its_poses(
     scene = box_scene([((1.10, 0.0), 0.0, (0.1, 0.2, 0.2)), ASIDE])
     free, touching = pose(1.0, 0.0, 0.8), pose(1.102, 0.0, 0.70)
     simulator = simulate(scene)
-    assert simulator.move(FIRST, np.concatenate([touching, free], axis=1)).touched[0]
+    assert simulator.move(FIRST, straight_leg(touching[:, 0], free[:, 0]), RESOLUTION_M).touched[0]
     # Nothing is kept from one motion to the next.
-    assert not simulator.move(FIRST, free).touched[0]
+    assert not simulator.move(FIRST, free, RESOLUTION_M).touched[0]
 
 
-def test_intermediate_poses_show_what_two_far_ones_miss(
+def test_what_lies_between_two_poses_is_not_missed(
     simulate: Callable[[Scenes], PyBulletSimulator], box_scene: SceneBuilder
 ) -> None:
-    wall = ((1.00, 0.0), 0.0, (0.08, 0.12, 0.24))
-    scene = box_scene([((1.30, 0.30), 0.0, (0.1, 0.12, 0.12)), wall])
-    joints = pose(1.1, -0.35, 0.7)[:, 0]
-    start = Tools(joints, np.array([[1.1, -0.35, 0.7]]), np.zeros(1), np.array([[1.0, 0, 0]]))
-    simulator, collided = simulate(scene), {}
-    for checks in (0, 1, 4, 20):
-        arm = Arm(ROBOT, Workspace(), checks)
-        action = arm.action(np.array([[1.1, 0.35, 0.7]]), np.zeros(1))
-        _, path, _ = arm.reach(start, action)
-        assert path.shape == (1, checks + 1, 6)
-        collided[checks] = bool(simulator.move(FIRST, path).collided[0])
-    assert collided == {0: False, 1: True, 4: True, 20: True}
+    wall = ((1.00, 0.0), 0.0, (0.004, 0.12, 0.24))
+    simulator = simulate(box_scene([((1.30, 0.30), 0.0, (0.1, 0.12, 0.12)), wall]))
+    right, left = pose(1.1, -0.35, 0.7)[:, 0], pose(1.1, 0.35, 0.7)[:, 0]
+    for end in (right, left):
+        assert not simulator.move(FIRST, end[:, None], RESOLUTION_M).collided[0]
+    assert simulator.move(FIRST, straight_leg(right, left), RESOLUTION_M).collided[0]
+    over = straight_leg(pose(1.1, -0.35, 1.0)[:, 0], pose(1.1, 0.35, 1.0)[:, 0])
+    assert not simulator.move(FIRST, over, RESOLUTION_M).collided[0]
 
 
 def test_the_robot_stays_where_it_moved(
@@ -320,10 +316,10 @@ def test_the_robot_stays_where_it_moved(
     simulator = simulate(box_scene([((1.3, 0.3), 0.0, (0.1, 0.15, 0.15))]))
     views = fixed_views(Camera(type="depth"))
     before = simulator.render(FIRST, views)
-    simulator.move(FIRST, pose(1.1, 0.0, 0.8))
+    simulator.move(FIRST, pose(1.1, 0.0, 0.8), RESOLUTION_M)
     after = simulator.render(FIRST, views)
     assert (after < before - 0.05).mean() > 0.01  # it is in the picture now
-    simulator.move(FIRST, home(1)[:, None])
+    simulator.move(FIRST, home(1)[:, None], RESOLUTION_M)
     np.testing.assert_array_equal(simulator.render(FIRST, views), before)
 
 
@@ -337,13 +333,13 @@ def test_worlds_of_one_client_do_not_see_each_other(
     scenes, views = sampled(count)
     shared = simulate(scenes)
     path = reaching(scenes, 0)
-    contacts = shared.move(np.arange(count), path)
+    contacts = shared.move(np.arange(count), path, RESOLUTION_M)
     images = shared.render(np.arange(count), views["depth"])
     again = shared.render(np.arange(count)[::3], views["depth"][::3])
     np.testing.assert_array_equal(again, images[::3])
     for i in range(count):
         alone = simulate(scenes[i : i + 1])
-        single = alone.move(FIRST, path[i : i + 1])
+        single = alone.move(FIRST, path[i : i + 1], RESOLUTION_M)
         assert single.touched[0] == contacts.touched[i]
         assert single.collided[0] == contacts.collided[i]
         np.testing.assert_array_equal(alone.render(FIRST, views["depth"][i : i + 1])[0], images[i])
@@ -356,14 +352,14 @@ def rollout(simulator: PyBulletSimulator, count: int) -> list[np.ndarray]:
     rng, seen, everywhere = np.random.default_rng(0), [], np.arange(count)
     first, _ = sampled(count, 100)
     simulator.load(everywhere, first, home(count))
-    simulator.move(everywhere, reaching(first, 5))
+    simulator.move(everywhere, reaching(first, 5), RESOLUTION_M)
     views = fixed_views(Camera(type="depth", width=40, height=40), count)
     for step in range(8):
         index = np.flatnonzero(rng.random(count) < 0.6)
         index = index[index % 2 == 1] if step < 6 else index  # every second world waits
         scenes, _ = sampled(len(index), step)
         simulator.load(index, scenes, home(len(index)))
-        contacts = simulator.move(index, reaching(scenes, step))
+        contacts = simulator.move(index, reaching(scenes, step), RESOLUTION_M)
         seen += [contacts.touched, contacts.collided, simulator.render(everywhere, views)]
     return seen
 

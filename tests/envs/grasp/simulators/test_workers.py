@@ -24,6 +24,7 @@ from envs.grasp.simulators.workers import ParallelSimulator
 
 ROOT = Path(__file__).parents[4]
 ROBOT = load_robot()
+RESOLUTION_M = 0.005
 COUNT = 7  # not a multiple of the workers
 CAMERAS = {
     "depth": Camera(type="depth", width=48, height=40),
@@ -47,7 +48,7 @@ def paths(scenes_and_views: tuple[Scenes, dict[str, CameraPoses]]) -> np.ndarray
     scenes, _ = scenes_and_views
     near = scenes.target_m + np.random.default_rng(1).uniform(-0.05, 0.05, (COUNT, 3))
     joints, _ = InverseKinematics(ROBOT)(near, scenes.target_yaw_rad)
-    part = np.linspace(0.25, 1.0, 4)[None, :, None]
+    part = np.linspace(0.2, 1.0, 5)[None, :, None]
     return home(1)[None] * (1 - part) + joints[:, None] * part
 
 
@@ -96,7 +97,7 @@ def test_results_are_those_of_one_process(
             simulator.load(index, scenes[index], home(len(index)))
             images = [simulator.render(index, view[index]) for view in views.values()]
             images.append(simulator.render_depth(index, views["depth"][index], SPACE, seeds[index]))
-            contacts = simulator.move(index, paths[index])
+            contacts = simulator.move(index, paths[index], RESOLUTION_M)
             images.append(simulator.render(index, views["rgb"][index]))  # the robot moved
             results.append([contacts.touched, contacts.collided, *images])
         for expected, seen in zip(*results, strict=True):
@@ -146,9 +147,9 @@ def test_a_workers_exception_is_passed_on_and_leaves_no_answer_behind(
     for simulator in (in_process, two_workers):
         simulator.load(late, scenes[late], home(len(late)))
     with pytest.raises(SimulatorError, match=r"worker 0 failed: KeyError"):
-        two_workers.move(np.arange(COUNT), paths)
+        two_workers.move(np.arange(COUNT), paths, RESOLUTION_M)
     # The second worker has moved its robots; its next answer is the one to the next question.
-    in_process.move(late, paths[late])
+    in_process.move(late, paths[late], RESOLUTION_M)
     np.testing.assert_array_equal(
         two_workers.render(late, views["depth"][late]),
         in_process.render(late, views["depth"][late]),
