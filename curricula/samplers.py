@@ -74,6 +74,11 @@ class UniformSampler(BaseModel, frozen=True, extra="forbid"):
     sampler_type: Literal["uniform"] = Field(description="Name of the distribution.")
     sampler_parameters: UniformParameters = Field(description="Its bounds.")
 
+    @property
+    def limits(self) -> Interval:
+        """Smallest and largest value."""
+        return self.sampler_parameters.min_value, self.sampler_parameters.max_value
+
     def sample(self, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
         """Draw ``size`` independent values.
 
@@ -94,6 +99,11 @@ class GaussianSampler(BaseModel, frozen=True, extra="forbid"):
     sampler_type: Literal["gaussian"] = Field(description="Name of the distribution.")
     sampler_parameters: GaussianParameters = Field(description="Its mean and deviation.")
 
+    @property
+    def limits(self) -> Interval:
+        """Smallest and largest value: there are none."""
+        return -math.inf, math.inf
+
     def sample(self, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
         """Draw ``size`` independent values; see `UniformSampler.sample`."""
         moments = self.sampler_parameters
@@ -108,6 +118,12 @@ class MultiRangeUniformSampler(BaseModel, frozen=True, extra="forbid"):
 
     sampler_type: Literal["multirangeuniform"] = Field(description="Name of the distribution.")
     sampler_parameters: MultiRangeUniformParameters = Field(description="Its intervals.")
+
+    @property
+    def limits(self) -> Interval:
+        """Smallest and largest value."""
+        starts, stops = zip(*self.sampler_parameters.intervals, strict=True)
+        return min(starts), max(stops)
 
     def sample(self, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
         """Draw ``size`` independent values; see `UniformSampler.sample`."""

@@ -36,6 +36,12 @@ class GoalRegion(Batch):
         """The same region n times."""
         return cls(*(np.full(n, getattr(goal, field.name)) for field in fields(cls)))
 
+    @property
+    def middle_m(self) -> Floats:
+        """The middles (n, 3), in the block frames."""
+        gap_m = (self.gap_min_m + self.gap_limit_m) / 2.0
+        return np.stack([np.zeros_like(gap_m), np.zeros_like(gap_m), gap_m], axis=1)
+
     def position_is_right(self, offset_m: Floats) -> Bools:
         """Whether tooltips at (n, 3) of the block frame lie inside: (n,)."""
         lateral, vertical, gap = offset_m.T
@@ -49,7 +55,7 @@ class GoalRegion(Batch):
 
 def goal_middle_m(goal: Goal) -> Floats:
     """The middle (3,) of a goal region, in the block frame."""
-    return np.array([0.0, 0.0, (goal.gap_min_m + goal.gap_limit_m) / 2])
+    return GoalRegion.like(goal, 1).middle_m[0]
 
 
 @dataclass(frozen=True)

@@ -23,17 +23,18 @@ from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.observations import PRIVILEGED, observation_space, privileged_state
 from envs.grasp.robot.arm import Arm
 from envs.grasp.robot.urdf import load_robot
-from envs.grasp.scene.sampler import Scenes, SceneSampler
+from envs.grasp.scene.sampler import Scenes, SceneSampler, check_yaw_limit, yaw_limit_range
 from envs.grasp.sensors.camera import CameraPoses, overviews
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.factory import make_simulator
-from envs.grasp.task import EpisodeProgress, GoalRegion, Motion, advance, goal_middle_m, judge
+from envs.grasp.task import EpisodeProgress, GoalRegion, Motion, advance, judge
 from rewards.grasp.transition import GraspTransition
 from rewards.reward import RewardTerm, fitting, weigh
 
 GOAL_PARAMETERS = ("lateral_limit_m", "vertical_limit_m", "gap_limit_m", "yaw_limit_deg")
 # Those of the depth cameras' sensors, and what a sampler's numbers are clipped to.
 SENSOR_PARAMETERS = {"noise_sigma_m": (0.0, np.inf), "missing_fraction": (0.0, 1.0)}
+YAW_LIMIT = "block_yaw_limit_deg"
 
 
 class GraspVectorEnv(Environment):
@@ -53,7 +54,7 @@ class GraspVectorEnv(Environment):
     Settings = GraspSettings
     snapshot: ClassVar[type[GraspTransition]] = GraspTransition
     parameter_names: ClassVar[frozenset[str]] = frozenset(
-        {*GOAL_PARAMETERS, *SENSOR_PARAMETERS, "block_yaw_limit_deg"}
+        {*GOAL_PARAMETERS, *SENSOR_PARAMETERS, YAW_LIMIT}
     )
     evaluation_episodes: ClassVar[int] = 1000
     evaluation_options: ClassVar[tuple[EvaluationOption, ...]] = EVALUATION_OPTIONS
@@ -147,8 +148,14 @@ class GraspVectorEnv(Environment):
     # -- training's interface --------------------------------------------------------------------
 
     def set_parameters(self, parameters: Mapping[str, ParameterValue]) -> None:
-        """See `Environment.set_parameters`."""
+        """See `Environment.set_parameters`.
+
+        Raises:
+            ValueError: there is no such parameter, or the blocks have no yaw within its limit.
+        """
         super().set_parameters(parameters)
+        if YAW_LIMIT in parameters:
+            check_yaw_limit(parameters[YAW_LIMIT], self._settings.randomize.block_yaw_deg)
         self._parameters = dict(parameters)
 
     def state_dict(self) -> dict[str, Any]:
@@ -190,6 +197,7 @@ class GraspVectorEnv(Environment):
         tooltip_m, yaw_rad = self._arm.pose(np.asarray(actions, np.float64))
         return PoseCommands(
             scenes=episodes.scenes[:n],
+            region=episodes.region[:n],
             tooltip_m=tooltip_m,
             yaw_rad=yaw_rad,
             views={name: views[:n] for name, views in episodes.views.items()},
@@ -220,7 +228,8 @@ class GraspVectorEnv(Environment):
         n = len(indices)
         given = {name: draw(value, self._rng, n) for name, value in self._parameters.items()}
         limits = {name: given[name] for name in GOAL_PARAMETERS if name in given}
-        yaw_limit_rad = np.radians(given.get("block_yaw_limit_deg", np.full(n, 180.0)))
+        least, most = yaw_limit_range(self._settings.randomize.block_yaw_deg)
+        yaw_limit_rad = np.radians(np.clip(given.get(YAW_LIMIT, np.full(n, most)), least, most))
         scenes, views = self._sampler.sample(self._rng, yaw_limit_rad)
         sensor = {
             name: given[name].clip(*ends)
@@ -263,8 +272,8 @@ class GraspVectorEnv(Environment):
         return observations
 
     def _episode_metrics(self, transition: GraspTransition) -> dict[str, NDArray[Any]]:
-        """What to report: errors to the middle of the final goal region, and how it went."""
-        error = np.abs(transition.offset_m - goal_middle_m(self._settings.goal))
+        """What to report: errors to the middles of the episodes' regions, and how it went."""
+        error = np.abs(transition.offset_m - self._running().region.middle_m)
         return {
             "success": transition.rotation_right,
             "collision": self._running().progress.collided,

@@ -67,6 +67,12 @@ def test_multirange_stays_inside_its_intervals(intervals, seed):
         assert any(start <= value <= stop for start, stop in intervals)
 
 
+def test_limits_hold_all_that_is_drawn():
+    assert uniform(-30, 10).limits == (-30, 10)
+    assert sampler("multirangeuniform", intervals=[[10, 13], [-2, -1]]).limits == (-2, 13)
+    assert sampler("gaussian", mean=0, st_dev=1).limits == (-np.inf, np.inf)
+
+
 def test_draws_are_independent_and_seeded():
     for chosen in (
         uniform(0, 1),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses
+from envs.grasp.task import GoalRegion
 
 Floats = NDArray[np.float64]
 
@@ -20,6 +21,7 @@ class PoseCommands:
 
     Attributes:
         scenes: the n scenes.
+        region: what counts as right in them.
         tooltip_m: (n, 3) where the centre of the cup's face is sent, world frame.
         yaw_rad: (n,) the tool's yaw there.
         views: where each camera stands, by its name.
@@ -27,6 +29,7 @@ class PoseCommands:
     """
 
     scenes: Scenes
+    region: GoalRegion
     tooltip_m: Floats
     yaw_rad: Floats
     views: dict[str, CameraPoses]

@@ -83,7 +83,7 @@ class GraspReport:
         return PoseErrors(
             target_m=target_m,
             target_yaw_deg=np.degrees(target_yaw_rad),
-            error_m=offset_m - goal_middle_m(self._settings.goal),
+            error_m=offset_m - commands.region.middle_m,
             yaw_error_deg=np.degrees(yaw_error(commands.yaw_rad, target_yaw_rad)),
             outcome=names,
         )

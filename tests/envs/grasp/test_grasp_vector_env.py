@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from curricula.samplers import (
     GaussianParameters,
     GaussianSampler,
+    ParameterValue,
     UniformParameters,
     UniformSampler,
 )
@@ -29,6 +30,16 @@ SMALL = {"depth": Camera(type="depth", width=32, height=24)}
 BOTH = {**SMALL, "above": Camera(type="rgb", width=20, height=30, fov_deg=50)}
 MODES = pytest.mark.parametrize("frame_grab", [True, False], ids=["frame_grab", "stream"])
 MakeEnv = Callable[..., GraspVectorEnv]
+
+
+def uniform(low: float, high: float) -> UniformSampler:
+    parameters = UniformParameters(min_value=low, max_value=high)
+    return UniformSampler(sampler_type="uniform", sampler_parameters=parameters)
+
+
+def gaussian(mean: float, st_dev: float) -> GaussianSampler:
+    parameters = GaussianParameters(mean=mean, st_dev=st_dev)
+    return GaussianSampler(sampler_type="gaussian", sampler_parameters=parameters)
 
 
 def terms(*names: str, weight: float = 1.0) -> list[RewardTerm]:
@@ -444,8 +455,11 @@ def test_parameters_hold_from_the_next_reset_on(make: MakeEnv) -> None:
     np.testing.assert_allclose(observations["privileged"][0, 13:16], [0.1, 1.0, 1.2], rtol=1e-6)
     _, _, terminated, _, infos = env.step(perfect(env, **far))
     np.testing.assert_array_equal(terminated, mask)
-    # Errors are reported against the last lesson's region all the same.
-    np.testing.assert_allclose(infos["episode_metrics"]["position_error_y_m"], 0.02)
+    # Errors are reported to the middle of the region that was asked for: a gap of 65 or 15 mm.
+    metrics = infos["episode_metrics"]
+    np.testing.assert_allclose(metrics["position_error_y_m"], 0.02)
+    np.testing.assert_allclose(metrics["position_error_z_m"], [0.0, 0.05, 0.05], atol=1e-12)
+    np.testing.assert_allclose(metrics["position_error_m"][0], 0.02)
 
 
 def test_parameters_replace_those_set_before(make: MakeEnv) -> None:
@@ -477,6 +491,34 @@ def test_the_blocks_yaw_limit_is_a_parameter(make: MakeEnv) -> None:
     env.reset(seed=0)
     yaw = np.degrees(np.abs(env.scenes.block_yaw_rad))
     assert 2.0 < yaw.max() <= 3.0
+
+
+@pytest.mark.parametrize(
+    ("value", "yaw_deg", "words"),
+    [
+        (31.0, (-30.0, 30.0), "31: .*from -30 to 30 deg.*leaves 0 to 30"),
+        (-1.0, (-30.0, 30.0), "-1: "),
+        (5.0, (10.0, 30.0), "5: .*leaves 10 to 30"),
+        (5.0, (-30.0, -10.0), "5: .*leaves 10 to 30"),
+        (uniform(5.0, 40.0), (-30.0, 30.0), "5 to 40: "),
+    ],
+)
+def test_a_limit_outside_of_the_blocks_yaw_is_refused(
+    make: MakeEnv, value: ParameterValue, yaw_deg: tuple[float, float], words: str
+) -> None:
+    env = make(1, randomize={"block_yaw_deg": yaw_deg})
+    with pytest.raises(ValueError, match=f"block_yaw_limit_deg {words}"):
+        env.set_parameters({"block_yaw_limit_deg": value})
+
+
+def test_limits_inside_of_the_blocks_yaw_are_obeyed(make: MakeEnv) -> None:
+    env = make(16, randomize={"block_yaw_deg": (10.0, 30.0)})
+    for value in (10.0, 30.0, uniform(10.0, 30.0), gaussian(20.0, 50.0)):
+        env.set_parameters({"block_yaw_limit_deg": value})
+        env.reset(seed=0)
+        yaw = np.degrees(env.scenes.block_yaw_rad)
+        assert yaw.min() >= 10.0 - 1e-9
+        assert yaw.max() <= 30.0 + 1e-9
 
 
 def test_the_sensors_noise_is_a_parameter(make: MakeEnv) -> None:
