@@ -245,8 +245,8 @@ def _empty_worlds(worlds: int, boxes: int, joints: int) -> WorldArrays:
         axes=np.zeros((worlds, boxes, 3, 3)),
         half=np.zeros((worlds, boxes, 3)),
         radius=np.zeros((worlds, boxes)),
-        low=np.zeros((worlds, 3)),
-        high=np.zeros((worlds, 3)),
+        low=np.zeros((worlds, 2, 3)),
+        high=np.zeros((worlds, 2, 3)),
         is_target=np.zeros((worlds, boxes), bool),
         colors=np.zeros((worlds, boxes, 3)),
         light=np.zeros((worlds, 3)),
@@ -274,12 +274,13 @@ def _boxes(scenes: Scenes) -> tuple[Floats, Floats, Floats]:
 
 
 def _room(worlds: WorldArrays, indices: Indices) -> tuple[Floats, Floats]:
-    """Lower and upper ends (n, 3) of the room that all boxes of some worlds take."""
+    """Lower and upper ends (n, 2, 3) of the room that support and blocks of some worlds take."""
     center, half = worlds.center[indices], worlds.half[indices]
     reach = np.matmul(np.abs(worlds.axes[indices]), half[..., None])[..., 0]
     there = worlds.radius[indices, :, None] > 0.0
-    low = np.where(there, center - reach, np.inf).min(axis=1)
-    return low, np.where(there, center + reach, -np.inf).max(axis=1)
+    low, high = np.where(there, center - reach, np.inf), np.where(there, center + reach, -np.inf)
+    first = np.array([0, 1])  # the support's box, and the blocks' first
+    return np.minimum.reduceat(low, first, axis=1), np.maximum.reduceat(high, first, axis=1)
 
 
 def _view_arrays(views: CameraPoses, n: int) -> ViewArrays:

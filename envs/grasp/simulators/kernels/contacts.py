@@ -52,6 +52,7 @@ class Room(NamedTuple):
         speeds: (J,) first derivatives now.
         frames: (L, 3, 4) of the links.
         turns, drifts: (L, 3) angular velocities of the links, and velocities of their origins.
+        rates: (L,) sizes of the angular velocities.
         bends: (S,) largest accelerations of the shapes' points on the leg.
         idle: (S,) whether nothing more can happen to the shapes on the leg.
     """
@@ -62,6 +63,7 @@ class Room(NamedTuple):
     frames: Floats
     turns: Floats
     drifts: Floats
+    rates: Floats
     bends: Floats
     idle: Bools
 
@@ -100,6 +102,7 @@ def touch_along(
             np.empty((links, 3, 4)),
             np.zeros((links, 3)),
             np.zeros((links, 3)),
+            np.zeros(links),
             np.empty(shapes),
             np.empty(shapes, np.bool_),
         ),
@@ -168,8 +171,8 @@ def _begin_leg(paths: Floats, row: int, number: int, reach: Floats, room: Room) 
 
     Returns whether anything moves on it.
     """
-    leg, bends, first, moves = room.leg, room.bends, 2 * number, False
-    room.idle[:] = False
+    leg, first, moves, before = room.leg, 2 * number, False, 0.0
+    room.idle[:], room.bends[:] = False, 0.0
     for joint in range(paths.shape[2]):
         start, middle, end = (
             paths[row, first, joint],
@@ -180,15 +183,12 @@ def _begin_leg(paths: Floats, row: int, number: int, reach: Floats, room: Room) 
         leg[1, joint] = 4.0 * middle - 3.0 * start - end
         leg[2, joint] = 4.0 * (start + end - 2.0 * middle)
         moves = moves or middle != start or end != start
-    for shape in range(len(bends)):
-        before = bend = 0.0
-        for joint in range(paths.shape[2]):
-            # The speed is linear in time, and largest at an end.
-            speed = max(abs(leg[1, joint]), abs(leg[1, joint] + leg[2, joint]))
-            turns = speed * (speed + 2.0 * before) + abs(leg[2, joint])
-            bend += reach[shape, joint] * turns
-            before += speed
-        bends[shape] = bend
+        # The speed is linear in time, and largest at an end.
+        speed = max(abs(leg[1, joint]), abs(leg[1, joint] + leg[2, joint]))
+        turns = speed * (speed + 2.0 * before) + abs(leg[2, joint])
+        before += speed
+        for shape in range(len(reach)):
+            room.bends[shape] += reach[shape, joint] * turns
     return moves
 
 
@@ -220,8 +220,12 @@ def _look(
             continue
         radius, link, bend = radii[shape], links[shape], room.bends[shape]
         center = in_world(frames, link, poses[shape, 0, 3], poses[shape, 1, 3], poses[shape, 2, 3])
-        speed = _largest_speed(frames, room.turns, room.drifts, link, center, radius)
-        clear = _beyond(worlds.low, worlds.high, world, center) - radius
+        speed = _largest_speed(frames, room.turns, room.drifts, room.rates, link, center, radius)
+        square = min(
+            _square_beyond(worlds.low, worlds.high, world, 0, center),
+            _square_beyond(worlds.low, worlds.high, world, 1, center),
+        )
+        clear = math.sqrt(square) - radius
         done = collided and (touched or not robot.is_cup[shape])
         idle[shape] = done or clear > left * (speed + left * bend / 2.0)
         far = step * (speed + step * bend / 2.0)
@@ -328,11 +332,22 @@ def _stand(robot: RobotArrays, part: float, room: Room) -> None:
                 for k in range(3):
                     axis = frames[link, i, k] * robot.axes[joint, k]
                     turns[link, i] += axis * room.speeds[joint]
+        room.rates[link] = math.sqrt(
+            turns[link, 0] * turns[link, 0]
+            + turns[link, 1] * turns[link, 1]
+            + turns[link, 2] * turns[link, 2]
+        )
 
 
 @kernel(counts=False)
 def _largest_speed(
-    frames: Floats, turns: Floats, drifts: Floats, link: int, center: Vector, radius: float
+    frames: Floats,
+    turns: Floats,
+    drifts: Floats,
+    rates: Floats,
+    link: int,
+    center: Vector,
+    radius: float,
 ) -> float:
     """The largest speed of a point of a ball that moves with a link."""
     turn = (turns[link, 0], turns[link, 1], turns[link, 2])
@@ -347,17 +362,17 @@ def _largest_speed(
         drifts[link, 1] + sweep[1],
         drifts[link, 2] + sweep[2],
     )
-    return math.sqrt(dot(velocity, velocity)) + radius * math.sqrt(dot(turn, turn))
+    return math.sqrt(dot(velocity, velocity)) + radius * rates[link]
 
 
 @kernel(counts=False)
-def _beyond(low: Floats, high: Floats, world: int, point: Vector) -> float:
-    """The distance of a point to the room that all boxes take along the world's axes."""
+def _square_beyond(low: Floats, high: Floats, world: int, part: int, point: Vector) -> float:
+    """The squared distance of a point to the room that the support or the blocks take."""
     square = 0.0
     for i in range(3):
-        beyond = max(0.0, low[world, i] - point[i], point[i] - high[world, i])
+        beyond = max(0.0, low[world, part, i] - point[i], point[i] - high[world, part, i])
         square += beyond * beyond
-    return math.sqrt(square)
+    return square
 
 
 @kernel(counts=False)

@@ -74,8 +74,8 @@ class WorldArrays(NamedTuple):
         axes: (N, K, 3, 3) whose columns are the boxes' axes.
         half: (N, K, 3) half extents, zero where there is no box.
         radius: (N, K) of the balls about the boxes.
-        low: (N, 3) lower end of the room that all boxes of a world take.
-        high: (N, 3) its upper end.
+        low: (N, 2, 3) lower ends of the room that the support takes, and that all others take.
+        high: (N, 2, 3) their upper ends.
         is_target: (N, K) whether the box belongs to the target block.
         colors: (N, K, 3) in [0, 255].
         light: (N, 3) unit vectors towards the light.
@@ -136,17 +136,16 @@ def move_links(
     for link in range(len(parents)):
         parent, joint = parents[link], joints[link]
         for i in range(3):
-            for j in range(4):
-                if parent < 0:
+            if parent < 0:
+                for j in range(4):
                     frames[link, i, j] = origins[link, i, j]
-                else:
-                    frames[link, i, j] = (
-                        frames[parent, i, 0] * origins[link, 0, j]
-                        + frames[parent, i, 1] * origins[link, 1, j]
-                        + frames[parent, i, 2] * origins[link, 2, j]
-                    )
-            if parent >= 0:
-                frames[link, i, 3] += frames[parent, i, 3]
+                continue
+            a, b, c = frames[parent, i, 0], frames[parent, i, 1], frames[parent, i, 2]
+            for j in range(4):
+                frames[link, i, j] = (
+                    a * origins[link, 0, j] + b * origins[link, 1, j] + c * origins[link, 2, j]
+                )
+            frames[link, i, 3] += frames[parent, i, 3]
         if joint >= 0:
             axis = (axes[joint, 0], axes[joint, 1], axes[joint, 2])
             _turn(frames, link, axis, paths[row, pose, joint])
