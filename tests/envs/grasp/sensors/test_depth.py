@@ -8,6 +8,7 @@ from pydantic import ValidationError
 from worlds import fixed_views, home, sampled
 
 from encoders.spaces import DepthImage
+from envs.grasp.robot.urdf import load_robot
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.sensors.depth import sense_depth
 from envs.grasp.sensors.noise import fill_uniforms
@@ -157,7 +158,7 @@ def test_both_simulators_have_the_same_sensor(encoding: str) -> None:
     everywhere, seeds = np.arange(3), np.array([4, 5, 6], np.uint64)
     unseen = []
     for make in (PyBulletSimulator, FastSimulator):
-        simulator = make(3, Support())
+        simulator = make(3, load_robot(), Support())
         simulator.load(everywhere, scenes, home(3))
         depth = simulator.render(everywhere, view)
         raw = simulator.render_depth(everywhere, view, space, seeds)
