@@ -15,7 +15,7 @@ from envs.grasp.sensors.camera import focal_length_px
 from envs.grasp.settings import GraspSettings
 
 PRIVILEGED = "privileged"
-PRIVILEGED_SIZE = 22
+POSES_AND_PROGRESS, LIMITS = 18, 4
 # Brings the privileged numbers near 1: positions are decimetres off the workspace's middle.
 WORKSPACE_MIDDLE_M = np.array([1.05, 0.0, 0.75])
 DECIMETRES_PER_M = 10.0
@@ -36,14 +36,21 @@ def observation_space(settings: GraspSettings) -> gymnasium.spaces.Dict:
         else:
             spaces[name] = RgbImage(camera.height, camera.width)
     if settings.privileged:
-        spaces[PRIVILEGED] = Box(-np.inf, np.inf, (PRIVILEGED_SIZE,), np.float32)
+        size = POSES_AND_PROGRESS + (LIMITS if settings.privileged_limits else 0)
+        spaces[PRIVILEGED] = Box(-np.inf, np.inf, (size,), np.float32)
     return gymnasium.spaces.Dict(spaces)
 
 
-def privileged_state(episodes: RunningEpisodes, episode_steps: int) -> NDArray[np.float32]:
-    """True state (N, 22): tool and target pose, goal limits, the episode's progress."""
+def privileged_state(episodes: RunningEpisodes, settings: GraspSettings) -> NDArray[np.float32]:
+    """True state (N, 22 or 18): tool and target pose, goal limits if set so, progress."""
     scenes, tools, region = episodes.scenes, episodes.tools, episodes.region
     progress, yaw = episodes.progress, episodes.scenes.target_yaw_rad
+    limits = [
+        region.lateral_limit_m * DECIMETRES_PER_M,
+        region.vertical_limit_m * DECIMETRES_PER_M,
+        region.gap_limit_m * DECIMETRES_PER_M,
+        np.radians(region.yaw_limit_deg) * DECIMETRES_PER_M,
+    ]
     columns = [
         (tools.tooltip_m - WORKSPACE_MIDDLE_M) * DECIMETRES_PER_M,
         np.sin(tools.yaw_rad),
@@ -52,11 +59,8 @@ def privileged_state(episodes: RunningEpisodes, episode_steps: int) -> NDArray[n
         np.sin(yaw),
         (tools.tooltip_m - scenes.target_m) * DECIMETRES_PER_M,
         np.sin(tools.yaw_rad - yaw),
-        region.lateral_limit_m * DECIMETRES_PER_M,
-        region.vertical_limit_m * DECIMETRES_PER_M,
-        region.gap_limit_m * DECIMETRES_PER_M,
-        np.radians(region.yaw_limit_deg) * DECIMETRES_PER_M,
-        progress.steps / episode_steps,
+        *(limits if settings.privileged_limits else ()),
+        progress.steps / settings.episode_steps,
         progress.steps == 0,
         progress.touched,
         progress.position_right,

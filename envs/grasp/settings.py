@@ -212,6 +212,11 @@ class GraspSettings(BaseModel, frozen=True, extra="forbid"):
     privileged: bool = Field(
         False, description="Offer the observation `privileged` (true state), meant for a critic."
     )
+    privileged_limits: bool = Field(
+        True,
+        description="Whether `privileged` has the goal's limits; with rewards that ignore them, "
+        "they are noise that jumps at every lesson.",
+    )
     blocks: int = Field(3, ge=1, le=6, description="Blocks on the support.")
     target_lead_m: float = Field(
         0.05, ge=0.0, description="How much nearer to the robot the first block is."

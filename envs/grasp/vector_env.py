@@ -41,8 +41,8 @@ class GraspVectorEnv(Environment):
     """N KUKA KR 16 with suction cups, each before its own blocks. See `Environment`.
 
     Observations: one image for each camera by its name, (N, H, W, 1) depth or (N, H, W, 3) RGB, and
-    `privileged` (N, 22) where the settings ask for it. Actions: (N, 4) in [-1, 1], the tooltip's
-    x, y, z and yaw over the workspace.
+    `privileged` (N, 22), or (N, 18) without limits, where the settings ask for it. Actions: (N, 4)
+    in [-1, 1], the tooltip's x, y, z and yaw over the workspace.
 
     Args:
         settings: the task.
@@ -268,7 +268,7 @@ class GraspVectorEnv(Environment):
         episodes = self._running()
         observations: Observations = dict(episodes.images)
         if self._settings.privileged:
-            observations[PRIVILEGED] = privileged_state(episodes, self._settings.episode_steps)
+            observations[PRIVILEGED] = privileged_state(episodes, self._settings)
         return observations
 
     def _episode_metrics(self, transition: GraspTransition) -> dict[str, NDArray[Any]]:
