@@ -100,37 +100,50 @@ def place_blocks(
         begin: the first row.
         end: the row after the last.
     """
-    count = position_m.shape[1]
-    size_m = np.empty((count, 3))
+    size_m = np.empty((position_m.shape[1], 3))
     for row in range(begin, end):
         found[row] = False
-        stream = streams[row]
         for _ in range(MAX_TRIES):
-            if not _draw_positions(stream, rules, position_m[row]):
-                continue
-            _draw_yaws(stream, rules, yaw_limit_rad[row], yaw_rad[row])
-            for block in range(count):
-                point = _draw_block(
-                    stream, rules, size_m[block], box_center_m[row, block], box_half_m[row, block]
-                )
-                if block == 0:
-                    _to_world(
-                        0.0, point[0], point[1], position_m[row, 0], yaw_rad[row, 0], target_m[row]
-                    )
-            if (
-                _reachable(rules, target_m[row], yaw_rad[row, 0])
-                and _apart_on_support(rules, size_m, position_m[row], yaw_rad[row])
-                and _seen(
-                    rules,
-                    size_m,
-                    position_m[row],
-                    yaw_rad[row],
-                    camera_m[row],
-                    camera_rotation[row],
-                )
-            ):
-                found[row] = True
+            found[row] = _draw_scene(
+                streams[row],
+                rules,
+                yaw_limit_rad[row],
+                size_m,
+                box_center_m[row],
+                box_half_m[row],
+                position_m[row],
+                yaw_rad[row],
+                target_m[row],
+            ) and _seen(
+                rules, size_m, position_m[row], yaw_rad[row], camera_m[row], camera_rotation[row]
+            )
+            if found[row]:
                 break
+
+
+@numba.njit(cache=True)
+def _draw_scene(
+    stream: Stream,
+    rules: Rules,
+    yaw_limit_rad: float,
+    size_m: Floats,
+    box_center_m: Floats,
+    box_half_m: Floats,
+    position_m: Floats,
+    yaw_rad: Floats,
+    target_m: Floats,
+) -> bool:
+    """Draws one scene's blocks; False where they do not stand as they should."""
+    if not _draw_positions(stream, rules, position_m):
+        return False
+    _draw_yaws(stream, rules, yaw_limit_rad, yaw_rad)
+    for block in range(len(position_m)):
+        point = _draw_block(stream, rules, size_m[block], box_center_m[block], box_half_m[block])
+        if block == 0:
+            _to_world(0.0, point[0], point[1], position_m[0], yaw_rad[0], target_m)
+    return _reachable(rules, target_m, yaw_rad[0]) and _apart_on_support(
+        rules, size_m, position_m, yaw_rad
+    )
 
 
 @numba.njit(cache=True)

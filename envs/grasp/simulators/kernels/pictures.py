@@ -153,6 +153,21 @@ def _draw_world(
         )
         half, color = triple(halves, world, box), triple(colors, world, box)
         draw_box(picture, center, x_axis, y_axis, z_axis, half, color, lens, light)
+    _draw_robot(picture, robot, worlds, world, eye, lens, light, frames)
+
+
+@kernel()
+def _draw_robot(
+    picture: Canvas,
+    robot: RobotArrays,
+    worlds: WorldArrays,
+    world: int,
+    eye: Eye,
+    lens: Lens,
+    light: Light,
+    frames: Floats,
+) -> None:
+    """Draws a world's robot; `frames` (L, 3, 4) is room for its links."""
     move_links(
         robot.parents, robot.joints, robot.origins, robot.axes, worlds.joints, world, 0, frames
     )
