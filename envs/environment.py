@@ -15,8 +15,9 @@ from curricula.samplers import ParameterValue
 from envs.evaluation import EvaluationOption, Evaluator
 from rewards.reward import RewardTerm
 
-Observations = dict[str, NDArray[Any]]
-StepResult = tuple[Observations, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]
+ObservationArrays = dict[str, NDArray[Any]]
+"""Arrays (N, ...) by the observations' names."""
+StepResult = tuple[ObservationArrays, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]
 """Observations, rewards (N,), terminated (N,), truncated (N,) and infos."""
 
 
@@ -24,7 +25,7 @@ class EnvironmentFailure(RuntimeError):  # noqa: N818 - gymnasium's Error says s
     """An environment broke down, through no fault of the run file: a process died, for instance."""
 
 
-class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
+class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]]):
     """N environments stepped together, with dictionaries of observations.
 
     It resets an environment in the step its episode ends in (`AutoresetMode.SAME_STEP`). The
@@ -81,10 +82,10 @@ class Environment(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         """Everything needed to go on exactly as from here: plain values and arrays."""
         raise NotImplementedError
 
-    def load_state_dict(self, state: dict[str, Any]) -> Observations:
+    def load_state_dict(self, state: dict[str, Any]) -> ObservationArrays:
         """Goes back to a state; returns the observations it was left with."""
         raise NotImplementedError
 
     def evaluator(self) -> Evaluator:
-        """How policies are judged here; an environment that has nothing to add keeps this one."""
+        """Rules by which policies are judged; an environment with none of its own keeps these."""
         return Evaluator()

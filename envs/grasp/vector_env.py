@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from curricula.samplers import ParameterValue, draw
 from encoders.spaces import DepthImage
-from envs.environment import Environment, Observations, StepResult
+from envs.environment import Environment, ObservationArrays, StepResult
 from envs.evaluation import EvaluationOption
 from envs.grasp.episode_state import RunningEpisodes
 from envs.grasp.evaluation.evaluator import EVALUATION_OPTIONS, GraspEvaluator
@@ -93,7 +93,7 @@ class GraspVectorEnv(Environment):
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
+    ) -> tuple[ObservationArrays, dict[str, Any]]:
         """Begins new episodes, in all environments or where `options["reset_mask"]` (N,) is set."""
         if seed is not None:
             self._rng = np.random.default_rng(seed)
@@ -162,7 +162,7 @@ class GraspVectorEnv(Environment):
         """See `Environment.state_dict`."""
         return {"rng": self._rng.bit_generator.state, **self._running().state_dict()}
 
-    def load_state_dict(self, state: dict[str, Any]) -> Observations:
+    def load_state_dict(self, state: dict[str, Any]) -> ObservationArrays:
         """See `Environment.load_state_dict`."""
         self._rng.bit_generator.state = state["rng"]
         self._episodes = episodes = RunningEpisodes.from_state_dict(state, self._settings.cameras)
@@ -192,7 +192,7 @@ class GraspVectorEnv(Environment):
         return self._arm.action(tooltip_m, yaw_rad)
 
     def _pose_commands(self, actions: NDArray[Any]) -> PoseCommands:
-        """Where actions (n, 4) would lead in the first n environments."""
+        """Poses that actions (n, 4) command in the first n environments."""
         n, episodes = len(actions), self._running()
         tooltip_m, yaw_rad = self._arm.pose(np.asarray(actions, np.float64))
         return PoseCommands(
@@ -253,7 +253,7 @@ class GraspVectorEnv(Environment):
     def _pictures(
         self, indices: NDArray[np.int64], views: Mapping[str, CameraPoses]
     ) -> dict[str, NDArray[Any]]:
-        """What each camera observes now in some worlds, (n, H, W, C) by its name."""
+        """Images (n, H, W, C) of each camera now in some worlds, by its name."""
         pictures: dict[str, NDArray[Any]] = {}
         for name, view in views.items():
             space = self.single_observation_space[name]
@@ -264,15 +264,15 @@ class GraspVectorEnv(Environment):
                 pictures[name] = self._simulator.render(indices, view)
         return pictures
 
-    def _observations(self) -> Observations:
+    def _observations(self) -> ObservationArrays:
         episodes = self._running()
-        observations: Observations = dict(episodes.images)
+        observations: ObservationArrays = dict(episodes.images)
         if self._settings.privileged:
             observations[PRIVILEGED] = privileged_state(episodes, self._settings)
         return observations
 
     def _episode_metrics(self, transition: GraspTransition) -> dict[str, NDArray[Any]]:
-        """What to report: errors to the middles of the episodes' regions, and how it went."""
+        """Episode metrics (N,) by name: errors to the middles of the regions, and how it went."""
         error = np.abs(transition.offset_m - self._running().region.middle_m)
         return {
             "success": transition.rotation_right,

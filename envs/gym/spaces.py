@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
-from envs.environment import Observations
+from envs.environment import ObservationArrays
 
 OBSERVATION = "observation"
 IMAGE_CHANNELS = (1, 3, 4)
@@ -51,7 +51,7 @@ class ObservationAdapter:
         self._parts = {name: _part(name, entry) for name, entry in entries.items()}
         self.space = gymnasium.spaces.Dict({k: part.space for k, part in self._parts.items()})
 
-    def __call__(self, batch: Any) -> Observations:
+    def __call__(self, batch: Any) -> ObservationArrays:
         """(N, ...) of gymnasium -> by name, new arrays (N, ...)."""
         entries = batch if self._is_dict else {OBSERVATION: batch}
         return {name: part.convert(entries[name]) for name, part in self._parts.items()}

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from numpy.typing import NDArray
 
-from envs.environment import Environment, EnvironmentFailure, Observations, StepResult
+from envs.environment import Environment, EnvironmentFailure, ObservationArrays, StepResult
 from envs.gym.making import make_vector_env
 from envs.gym.settings import GymSettings
 from envs.gym.spaces import ActionAdapter, ObservationAdapter
@@ -18,7 +18,7 @@ from rewards.gym.transition import GymTransition
 from rewards.reward import RewardTerm, fitting, weigh
 
 ADDED_INFOS = ("final_obs", "_final_obs", "final_info", "_final_info")
-"""What gymnasium itself adds to the infos of a step in which an episode ends."""
+"""Keys that gymnasium itself adds to the infos of a step in which an episode ends."""
 
 _logger = logging.getLogger("ventosa")
 
@@ -61,11 +61,11 @@ class GymEnvironment(Environment):
         self._begun = np.zeros(self.num_envs, np.int64)
         self._lengths = np.zeros(self.num_envs, np.int64)
         self._actions: list[NDArray[Any]] = []  # as many steps as the longest episode has
-        self._observations: Observations = {}
+        self._observations: ObservationArrays = {}
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
+    ) -> tuple[ObservationArrays, dict[str, Any]]:
         """Begins new episodes everywhere.
 
         Raises:
@@ -124,7 +124,7 @@ class GymEnvironment(Environment):
             "observations": self._observations,
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> Observations:
+    def load_state_dict(self, state: dict[str, Any]) -> ObservationArrays:
         """See `Environment.load_state_dict`; plays the running episodes again."""
         self._seed = state["seed"]
         self._begun, self._lengths = state["begun"].copy(), state["lengths"].copy()
@@ -159,7 +159,7 @@ class GymEnvironment(Environment):
         del self._actions[: len(self._actions) - self._lengths.max()]
         return {"final_obs": self._final(gathered["final_obs"], done), "_final_obs": done}
 
-    def _final(self, last: NDArray[Any], done: NDArray[np.bool_]) -> Observations:
+    def _final(self, last: NDArray[Any], done: NDArray[np.bool_]) -> ObservationArrays:
         """Observations (N, ...), right where episodes ended, from an array (N,) of objects."""
         ended = self._observe(self._stacked(list(last[done])))
         final = {
@@ -192,18 +192,18 @@ class GymEnvironment(Environment):
             raise EnvironmentFailure(f"the environment {self._id!r} failed: {reason}") from error
 
 
-def _before_reset(observations: Observations, infos: Mapping[str, Any]) -> Observations:
+def _before_reset(observations: ObservationArrays, infos: Mapping[str, Any]) -> ObservationArrays:
     """Observations (N, ...) after a step; where an episode ended, its last ones."""
     if not infos:
         return observations
     done, final = infos["_final_obs"], infos["final_obs"]
-    following = {name: values.copy() for name, values in observations.items()}
-    for name, values in following.items():
+    last = {name: values.copy() for name, values in observations.items()}
+    for name, values in last.items():
         values[done] = final[name][done]
-    return following
+    return last
 
 
-def _equal(first: Observations, second: Observations) -> bool:
+def _equal(first: ObservationArrays, second: ObservationArrays) -> bool:
     return first.keys() == second.keys() and all(
         np.array_equal(values, second[name]) for name, values in first.items()
     )

@@ -134,7 +134,7 @@ def ages(monkeypatch: pytest.MonkeyPatch) -> list[list[float]]:
         policy: ActorCritic, observations: Observations, *, deterministic: bool, generator: Any
     ) -> tuple[Tensor, Tensor]:
         assert observations.sequences is not None
-        state = observations.sequences.state
+        state = observations.sequences.hidden_state
         ages.append(state.flatten().tolist())
         return torch.zeros(len(state), *policy.action_head.bias.shape), state + 1.0
 

@@ -1,4 +1,4 @@
-"""What algorithms share that learn from a replay buffer, as DDPG does."""
+"""Common parts of algorithms that learn from a replay buffer, as DDPG does."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ class OffPolicyAlgorithm:
         """One optimizer step of the actor on transitions (B,); statistics by TensorBoard tag."""
 
     def _episodes_ended(self, done: NDArray[np.bool_]) -> None:
-        """Called after every step with (N,), for exploration that remembers."""
+        """Called after every step with (N,), for exploration with a state."""
 
     # -- collecting ------------------------------------------------------------------------------
 
@@ -203,7 +203,7 @@ class OffPolicyAlgorithm:
         if not collected:
             raise RuntimeError("update() comes after collect()")
         scheduled = self._schedule(run_fraction)
-        self._remember(collected)
+        self._store(collected)
         averager, hyper = Averager(), self._replay
         if len(self._buffer) >= hyper.buffer_init_steps:
             self._pending_updates += len(collected) * self._shape[0] * hyper.updates_per_step
@@ -227,11 +227,11 @@ class OffPolicyAlgorithm:
             statistics = self._improve_critic(indices)
         statistics |= self._improve_actor(indices)
         self.policy.update_targets()
-        # All at once: on an accelerator each look at a number waits for all that is under way.
+        # All at once: on an accelerator each number read waits for all that is under way.
         numbers = torch.stack([value.detach() for value in statistics.values()]).tolist()
         return dict(zip(statistics, numbers, strict=True))
 
-    def _remember(self, collected: Sequence[CollectedStep[Tensor]]) -> None:
+    def _store(self, collected: Sequence[CollectedStep[Tensor]]) -> None:
         """Adds what was collected to the buffer and to the statistics of the observations."""
         for step in collected:
             actions = step.acted.output.cpu().numpy()

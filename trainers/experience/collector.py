@@ -1,4 +1,4 @@
-"""Acting in N environments with a policy: what is observed, encoded once, done and remembered."""
+"""Collection in N environments: frames encoded once, hidden states carried from step to step."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ Output = TypeVar("Output")
 
 @dataclass(frozen=True)
 class Acted(Generic[Output]):
-    """What a behavior answers to N observations.
+    """Actions at N observations, and what comes with them.
 
     Attributes:
         actions: (N, ...) in the units of the environment's space.
         hidden_state: (N, m) after the observations.
-        output: whatever else learning needs of that moment.
+        output: whatever else learning needs of that step.
     """
 
     actions: Tensor
@@ -38,10 +38,10 @@ class Acted(Generic[Output]):
 
 
 class Behavior(Protocol[Output]):
-    """How an algorithm acts while it collects experience.
+    """An algorithm's way of acting while it collects experience.
 
     Attributes:
-        state_size: m, the numbers that it remembers from step to step; 0 without memory.
+        state_size: m, length of the hidden state; 0 without memory.
     """
 
     state_size: int
@@ -50,7 +50,7 @@ class Behavior(Protocol[Output]):
         """Features of U frames by name, (U, H, W, C)."""
 
     def act(self, observations: Observations, features: FrameFeatures) -> Acted[Output]:
-        """Answers N observations, whose frames are known by their features alone."""
+        """Actions at N observations, whose frames are known by their features alone."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class CollectedStep(Generic[Output]):
         features: of the frames in view before the step.
         vectors: (N, n) by name, before the step.
         hidden_state: (N, m) before the observations.
-        acted: what the behavior answered.
+        acted: the actions, with what the behavior gave beside them.
         step: what came of the actions.
     """
 

@@ -25,7 +25,7 @@ class NonFiniteError(FloatingPointError):
 
 @dataclass(frozen=True)
 class Step:
-    """What came of one action in each of N environments.
+    """Result of one action in each of N environments.
 
     Attributes:
         reward: (N,).

@@ -86,15 +86,15 @@ class ReplayBuffer:
         observations: Mapping[str, NDArray[Any]],
         actions: NDArray[np.float32],
         step: Step,
-        following: Mapping[str, NDArray[Any]],
+        next_observations: Mapping[str, NDArray[Any]],
     ) -> None:
         """Keeps one transition of each environment, in place of the oldest ones.
 
         Args:
-            observations: (N, ...) before the step; those that followed the step added last.
+            observations: (N, ...) before the step; the next observations of the step added last.
             actions: (N, A).
-            step: what came of them.
-            following: (N, ...) after the step, of new episodes where one ended.
+            step: their result.
+            next_observations: (N, ...) after the step, of new episodes where one ended.
         """
         here = self._row_indices(self._row)
         if not self._length:
@@ -110,10 +110,10 @@ class ReplayBuffer:
             self._release(there)
         else:
             self._length += 1
-        self._keep_vectors(there, following)
+        self._keep_vectors(there, next_observations)
         new = np.flatnonzero(~step.same_frame)
         self._frame[there] = self._frame[here]
-        self._frame[there][new] = self._frames.add(following, new)
+        self._frame[there][new] = self._frames.add(next_observations, new)
 
     def sample(self, count: int, generator: torch.Generator) -> NDArray[np.int64]:
         """Draws transitions, each as likely as any other: their indices (count,)."""
@@ -125,16 +125,16 @@ class ReplayBuffer:
         return indices
 
     def observations(self, indices: NDArray[np.int64], names: Collection[str]) -> Observations:
-        """What was seen before the transitions, as far as it is asked for by name."""
+        """Observations before the transitions (B,), those of `names`."""
         vectors = {k: values[indices] for k, values in self._vectors.items() if k in names}
         return self._tensors(vectors, self._frame[indices], names)
 
     def actions(self, indices: NDArray[np.int64]) -> Tensor:
-        """What was done, (B, A)."""
+        """Actions (B, A)."""
         return self._to_device(self._actions[indices])
 
     def rewards(self, indices: NDArray[np.int64]) -> Tensor:
-        """What was paid for it at once, (B,)."""
+        """Rewards (B,)."""
         return self._to_device(self._rewards[indices])
 
     def returns(
@@ -157,26 +157,26 @@ class ReplayBuffer:
         last, total = indices, self._rewards[indices]
         discount = np.full(len(indices), gamma, np.float32)
         for power in range(1, steps):
-            following = self._after(last)
-            unknown = following // self._num_envs == self._row
+            next_indices = self._after(last)
+            unknown = next_indices // self._num_envs == self._row
             goes_on = ~(self._done[last] | unknown)
-            last = np.where(goes_on, following, last)
-            total[goes_on] += gamma**power * self._rewards[following[goes_on]]
+            last = np.where(goes_on, next_indices, last)
+            total[goes_on] += gamma**power * self._rewards[next_indices[goes_on]]
             discount[goes_on] *= gamma
         discount[self._terminated[last]] = 0.0
         return self._to_device(total), self._to_device(discount), last
 
     def next_observations(self, indices: NDArray[np.int64], names: Collection[str]) -> Observations:
-        """What was seen after the transitions: where an episode was cut off, its last observation.
+        """Observations after the transitions (B,), those of `names`.
 
-        Where it terminated, there is nothing to see that has a value; it is some observation.
+        Where an episode was cut off, its last ones; where it terminated, any, as none has a value.
         """
-        following = self._after(indices)
-        vectors = {k: values[following] for k, values in self._vectors.items() if k in names}
-        frame, final = self._frame[following], self._final[indices]
+        next_indices = self._after(indices)
+        vectors = {k: values[next_indices] for k, values in self._vectors.items() if k in names}
+        frame, final = self._frame[next_indices], self._final[indices]
         cut = np.flatnonzero(final != NONE)
         if len(cut):
-            kept = self._finals.take(final[cut], (_FRAME, *vectors))
+            kept = self._finals.gather(final[cut], (_FRAME, *vectors))
             frame[cut] = kept[_FRAME]
             for name, values in vectors.items():
                 values[cut] = kept[name]
@@ -226,9 +226,9 @@ class ReplayBuffer:
         return slice(row * self._num_envs, (row + 1) * self._num_envs)
 
     def _after(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The indices of the next row."""
-        following: NDArray[np.int64] = (indices + self._num_envs) % len(self._rewards)
-        return following
+        """Indices of the next row."""
+        next_indices: NDArray[np.int64] = (indices + self._num_envs) % len(self._rewards)
+        return next_indices
 
     def _keep_vectors(self, indices: slice, observations: Mapping[str, NDArray[Any]]) -> None:
         for name, values in self._vectors.items():
@@ -256,11 +256,11 @@ class ReplayBuffer:
         frame, final = self._frame[indices], self._final[indices]
         cut = np.flatnonzero(final != NONE)
         if len(cut):
-            kept = self._finals.take(final[cut], (_FRAME,))[_FRAME]
+            kept = self._finals.gather(final[cut], (_FRAME,))[_FRAME]
             self._frames.release(kept[kept != frame[cut]])
             self._finals.release(final[cut])
-        following = self._frame[self._row_indices(indices.start // self._num_envs + 1)]
-        self._frames.release(frame[frame != following])
+        next_frame = self._frame[self._row_indices(indices.start // self._num_envs + 1)]
+        self._frames.release(frame[frame != next_frame])
 
     def _tensors(
         self,
@@ -273,7 +273,7 @@ class ReplayBuffer:
         if not images:
             return Observations({}, tensors)
         slots, index = np.unique(frame, return_inverse=True)
-        frames = {k: self._to_device(v) for k, v in self._frames.take(slots, images).items()}
+        frames = {k: self._to_device(v) for k, v in self._frames.gather(slots, images).items()}
         return Observations(frames, tensors, self._to_device(index))
 
     def _to_device(self, array: NDArray[Any]) -> Tensor:
@@ -305,8 +305,8 @@ class _Slots:
         self._touched = max(self._touched, len(self._free) - self._left)
         return slots
 
-    def take(self, slots: NDArray[np.int64], names: Collection[str]) -> dict[str, NDArray[Any]]:
-        """Copies of some entries, as far as they are asked for by name."""
+    def gather(self, slots: NDArray[np.int64], names: Collection[str]) -> dict[str, NDArray[Any]]:
+        """Copies of some entries, those of `names`."""
         return {name: self._arrays[name][slots] for name in names}
 
     def release(self, slots: NDArray[np.int64]) -> None:

@@ -66,7 +66,7 @@ def normalize(advantages: Tensor) -> Tensor:
 
 
 def explained_variance(returns: Tensor, values: Tensor) -> float:
-    """Return the share of the returns' variance that the values foresee.
+    """Share of the returns' variance that the values foresee.
 
     1 - Var[returns - values] / Var[returns]: 1 is a perfect critic, 0 one as good as any constant,
     below 0 worse than that. When all returns are equal there is nothing to foresee, the quotient is

@@ -33,7 +33,7 @@ class RewardNormalizer:
 
     @property
     def deviation(self) -> float:
-        """What rewards are divided by."""
+        """Standard deviation of the returns, by which rewards are divided."""
         return self._returns.deviation.item()
 
     def __call__(self, rewards: Tensor, done: Tensor) -> Tensor:

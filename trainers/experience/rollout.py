@@ -55,7 +55,7 @@ class Rollout:
         return Observations(chosen, vectors, index, self._sequences_of(rows))
 
     def _sequences_of(self, rows: Tensor) -> Sequences | None:
-        """The sequences that some rows make up; None where nothing is remembered."""
+        """The sequences that some rows make up; None without memory."""
         if not self.hidden_states.shape[1]:
             return None
         _, lengths = self.shuffle_groups[rows].unique_consecutive(return_counts=True)
@@ -67,9 +67,9 @@ class Rollout:
         if not self.frames:
             return {}, None
         frames, index = self.frame_index[rows], None
-        distinct, place = frames.unique(return_inverse=True)
+        distinct, position = frames.unique(return_inverse=True)
         if len(distinct) < len(frames):
-            frames, index = distinct, place
+            frames, index = distinct, position
         return {name: gather(tensor, frames) for name, tensor in self.frames.items()}, index
 
     def in_shuffle_groups(self) -> Tensor:
@@ -85,6 +85,6 @@ class Rollout:
         """
         count = int(self.shuffle_groups.max()) + 1
         device = self.shuffle_groups.device
-        place = torch.randperm(count, generator=generator, device=device)
-        order = torch.argsort(place[self.shuffle_groups], stable=True)
+        rank = torch.randperm(count, generator=generator, device=device)
+        order = torch.argsort(rank[self.shuffle_groups], stable=True)
         yield from order.split(size)

@@ -28,7 +28,7 @@ Judged = tuple[Distribution, Tensor]
 
 @dataclass(frozen=True)
 class _RolloutStep:
-    """What a rollout keeps of one step of N environments; the frames are in their store.
+    """One step of N environments as a rollout keeps it; the frames are in their store.
 
     Attributes:
         final_values: (N,) of the last observations of episodes that were cut off; else zero.

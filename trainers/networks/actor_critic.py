@@ -129,17 +129,17 @@ class ActorCritic(PolicyNetwork):
     def step(
         self, observations: Observations, features: FrameFeatures | None = None
     ) -> tuple[Distribution, Tensor, Tensor]:
-        """The distribution of actions, the values (B,), and the state (S, state_size) after."""
+        """The distribution of actions, the values (B,), and the hidden state (S, m) after."""
         known = features or FrameFeatures()
         seen_by_actor, seen_by_critic = self._split(observations)
-        hidden, state = self.actor.forward_recurrent(seen_by_actor, known.actor)
+        hidden, hidden_state = self.actor.forward_recurrent(seen_by_actor, known.actor)
         distribution, critic_hidden = self._distribution(hidden), hidden
         if self.critic is not None:
-            critic_hidden, critic_state = self.critic.forward_recurrent(
+            critic_hidden, critic_hidden_state = self.critic.forward_recurrent(
                 seen_by_critic, known.critic
             )
-            state = torch.cat([state, critic_state], dim=1)
-        return distribution, self._value(critic_hidden), state
+            hidden_state = torch.cat([hidden_state, critic_hidden_state], dim=1)
+        return distribution, self._value(critic_hidden), hidden_state
 
     def distribution(self, observations: Observations) -> Distribution:
         """The distribution of actions alone."""
@@ -157,12 +157,13 @@ class ActorCritic(PolicyNetwork):
         self, observations: Observations, *, deterministic: bool, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
         """See `PolicyNetwork.act`."""
-        hidden, state = self.actor.forward_recurrent(self._split(observations)[0])
+        hidden, hidden_state = self.actor.forward_recurrent(self._split(observations)[0])
         distribution = self._distribution(hidden)
         actions = distribution.mode() if deterministic else distribution.sample(generator)
-        # What a critic remembers is of no use here, and stays as it was at the beginning.
-        of_critic = self.state_size - self.actor.state_size
-        return actions, torch.cat([state, state.new_zeros(len(state), of_critic)], dim=1)
+        # A critic's hidden state is of no use here, and stays as it was at the beginning.
+        size = self.state_size - self.actor.state_size
+        unused = hidden_state.new_zeros(len(hidden_state), size)
+        return actions, torch.cat([hidden_state, unused], dim=1)
 
     def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
         """Features of U frames by name, (U, H, W, C)."""
@@ -199,14 +200,14 @@ class ActorCritic(PolicyNetwork):
         return value
 
     def _split(self, observations: Observations) -> tuple[Observations, Observations]:
-        """The observations with what the actor remembers, and with what the critic does."""
+        """Observations with the actor's hidden state, and with the critic's."""
         sequences = observations.sequences
         if sequences is None or self.state_size == 0:
             return observations, observations
-        actor, critic = sequences.state.tensor_split([self.actor.state_size], dim=1)
+        actor, critic = sequences.hidden_state.tensor_split([self.actor.state_size], dim=1)
         return (
-            replace(observations, sequences=replace(sequences, state=actor)),
-            replace(observations, sequences=replace(sequences, state=critic)),
+            replace(observations, sequences=replace(sequences, hidden_state=actor)),
+            replace(observations, sequences=replace(sequences, hidden_state=critic)),
         )
 
 

@@ -90,7 +90,7 @@ class DeterministicActorCritic(nn.Module):
 
     @property
     def _acting_encoder(self) -> Network:
-        """What the actor acts on: its own encoders, or those it shares with the critic."""
+        """Encoders that the actor acts on: its own, or those it shares with the critic."""
         return self.critic_encoder if self.actor_encoder is None else self.actor_encoder
 
     def value(self, observations: Observations, actions: Tensor) -> Tensor:
@@ -100,12 +100,12 @@ class DeterministicActorCritic(nn.Module):
         return values.squeeze(1)
 
     def actor_parameters(self) -> list[nn.Parameter]:
-        """What the policy's loss moves."""
+        """Parameters of the actor's loss."""
         own = [] if self.actor_encoder is None else list(self.actor_encoder.parameters())
         return [*own, *self.actor.parameters()]
 
     def critic_parameters(self) -> list[nn.Parameter]:
-        """What the critic's loss moves."""
+        """Parameters of the critic's loss."""
         return [*self.critic_encoder.parameters(), *self.critic.parameters()]
 
 

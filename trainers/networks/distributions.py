@@ -20,7 +20,7 @@ _LOG_2_PI = math.log(2 * math.pi)
 
 
 class Distribution(Protocol):
-    """What every distribution over actions can do; B is the number of rows."""
+    """A distribution over actions in each of B rows."""
 
     def sample(self, generator: torch.Generator | None = None) -> Tensor:
         """Draw one action per row; no gradient flows through it.
@@ -31,32 +31,32 @@ class Distribution(Protocol):
         ...
 
     def mode(self) -> Tensor:
-        """Return the likeliest action of each row, shaped as `sample` shapes it."""
+        """Likeliest action of each row, shaped as `sample` shapes it."""
         ...
 
     def log_prob(self, actions: Tensor) -> Tensor:
-        """Return the log density (or log probability) of one action per row, (B,), in nats."""
+        """Log density (or log probability) of one action per row, (B,), in nats."""
         ...
 
     def entropy(self) -> Tensor:
-        """Return the (differential) entropy of each row, (B,), in nats."""
+        """Entropy (or differential entropy) of each row, (B,), in nats."""
         ...
 
     def kl(self, other: Self) -> Tensor:
-        """Return KL(self || other) of each row, (B,), in nats."""
+        """KL(self || other) of each row, (B,), in nats."""
         ...
 
     def detach(self) -> Self:
-        """Return the same distribution, cut from the graph that computed it."""
+        """The same distribution, cut from the graph that computed it."""
         ...
 
     def __getitem__(self, rows: slice | Tensor) -> Self:
-        """Return the distribution of some rows: a slice, a mask (B,) or indices (M,)."""
+        """Distribution of some rows: a slice, a mask (B,) or indices (M,)."""
         ...
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
-        """Return the distribution of all rows of several, which one policy made."""
+        """Distribution of all rows of several, which one policy made."""
         ...
 
 
@@ -99,11 +99,11 @@ class DiagonalGaussian:
             return noise.mul_(self.log_std.exp()).add_(self.mean)
 
     def mode(self) -> Tensor:
-        """Return the mean, (B, A)."""
+        """Mean (B, A)."""
         return self.mean
 
     def log_prob(self, actions: Tensor) -> Tensor:
-        """Return the log density of one action per row, (B,).
+        """Log density of one action per row, (B,).
 
         Args:
             actions: (B, A).
@@ -123,13 +123,13 @@ class DiagonalGaussian:
         return -0.5 * deviation.square().sum(-1) - log_scale
 
     def entropy(self) -> Tensor:
-        """Return the differential entropy of each row, (B,); it may be negative."""
+        """Differential entropy of each row, (B,); it may be negative."""
         # H = sum_i log sigma_i + A/2 (1 + log 2 pi)
         constant = 0.5 * (1 + _LOG_2_PI) * self.mean.shape[-1]
         return (self.log_std.sum(-1) + constant).expand(self.mean.shape[0])
 
     def kl(self, other: DiagonalGaussian) -> Tensor:
-        """Return KL(self || other) of each row, (B,)."""
+        """KL(self || other) of each row, (B,)."""
         # KL(p || q) = 1/2 sum_i (s_i - 1 - log s_i + ((mu_p - mu_q)_i / sigma_q,i)^2)
         # with s = (sigma_p / sigma_q)^2; expm1 keeps s - 1 - log s exact for close distributions,
         # where a trust region measures it.
@@ -139,17 +139,17 @@ class DiagonalGaussian:
         return 0.5 * (spread + deviation.square().sum(-1))
 
     def detach(self) -> DiagonalGaussian:
-        """Return the same distribution, cut from the graph that computed it."""
+        """The same distribution, cut from the graph that computed it."""
         return DiagonalGaussian(self.mean.detach(), self.log_std.detach())
 
     def __getitem__(self, rows: slice | Tensor) -> DiagonalGaussian:
-        """Return the distribution of some rows: a slice, a mask (B,) or indices (M,)."""
+        """Distribution of some rows: a slice, a mask (B,) or indices (M,)."""
         shared = self.log_std.ndim < self.mean.ndim
         return DiagonalGaussian(self.mean[rows], self.log_std if shared else self.log_std[rows])
 
     @classmethod
     def concatenate(cls, parts: Sequence[DiagonalGaussian]) -> DiagonalGaussian:
-        """Return the distribution of all rows of several, which one policy made."""
+        """Distribution of all rows of several, which one policy made."""
         log_std = parts[0].log_std
         if log_std.ndim == parts[0].mean.ndim:
             log_std = torch.cat([part.log_std for part in parts])
@@ -180,11 +180,11 @@ class Categorical:
             return torch.multinomial(probabilities, 1, generator=generator).squeeze(-1)
 
     def mode(self) -> Tensor:
-        """Return the likeliest action of each row, (B,) int64."""
+        """Likeliest action of each row, (B,) int64."""
         return self.logits.argmax(-1)
 
     def log_prob(self, actions: Tensor) -> Tensor:
-        """Return the log probability of one action per row, (B,).
+        """Log probability of one action per row, (B,).
 
         Args:
             actions: (B,) int64.
@@ -193,25 +193,25 @@ class Categorical:
         return -F.cross_entropy(self.logits, actions, reduction="none")
 
     def entropy(self) -> Tensor:
-        """Return the entropy of each row, (B,), from 0 to log K."""
+        """Entropy of each row, (B,), from 0 to log K."""
         log_p = F.log_softmax(self.logits, -1)
         return -(log_p.exp() * log_p).sum(-1)
 
     def kl(self, other: Categorical) -> Tensor:
-        """Return KL(self || other) of each row, (B,)."""
+        """KL(self || other) of each row, (B,)."""
         log_p = F.log_softmax(self.logits, -1)
         log_q = F.log_softmax(other.logits, -1)
         return (log_p.exp() * (log_p - log_q)).sum(-1)
 
     def detach(self) -> Categorical:
-        """Return the same distribution, cut from the graph that computed it."""
+        """The same distribution, cut from the graph that computed it."""
         return Categorical(self.logits.detach())
 
     def __getitem__(self, rows: slice | Tensor) -> Categorical:
-        """Return the distribution of some rows: a slice, a mask (B,) or indices (M,)."""
+        """Distribution of some rows: a slice, a mask (B,) or indices (M,)."""
         return Categorical(self.logits[rows])
 
     @classmethod
     def concatenate(cls, parts: Sequence[Categorical]) -> Categorical:
-        """Return the distribution of all rows of several, which one policy made."""
+        """Distribution of all rows of several, which one policy made."""
         return cls(torch.cat([part.logits for part in parts]))

@@ -1,4 +1,4 @@
-"""What encoders made of frames, to be reused as long as neither changes."""
+"""Features of frames, to be reused as long as neither the frames nor the encoders change."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Standardizing(Protocol):
 
 
 class Network(nn.Module):
-    """Encodes observations, passes them through a trunk of dense layers, and perhaps remembers.
+    """Encodes observations, passes them through a trunk of dense layers, and perhaps a memory.
 
     Args:
         encoders: by the name of the observation; frames and vectors are told apart by `spaces`.
@@ -59,7 +59,7 @@ class Network(nn.Module):
 
     Attributes:
         features_dim: length of the hidden vector.
-        state_size: numbers that it remembers; 0 without memory.
+        state_size: m, length of the hidden state; 0 without memory.
     """
 
     def __init__(
@@ -84,9 +84,9 @@ class Network(nn.Module):
         self.state_size = 0 if self.memory is None else self.memory.state_size
 
     def encode_frames(self, frames: Mapping[str, Tensor]) -> Tensor | None:
-        """What frames alone decide, (U, f); None for a network without images.
+        """Features (U, f) of U frames by name; None for a network without images.
 
-        Where there are no vectors that is the whole network, so that experience which shares a
+        Without vectors that is the whole network but its memory, so that experience which shares a
         frame shares all of its cost.
         """
         if not self.frame_encoders:
@@ -103,27 +103,27 @@ class Network(nn.Module):
     def forward_recurrent(
         self, observations: Observations, frame_features: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Hidden vectors, and what is to be remembered.
+        """Hidden vectors, and the hidden states after them.
 
         Args:
             observations: B observations.
-            frame_features: (B, f) what `encode_frames` said of their frames, where it is known.
+            frame_features: (B, f) of their frames, from `encode_frames`, where they are known.
 
         Returns:
-            (B, features_dim), and the state (S, state_size) after the last of each sequence;
-            (B, 0) without memory.
+            (B, features_dim), and the hidden states (S, m) after the last of each sequence; (B, 0)
+            without memory.
         """
-        hidden = self._react(observations, frame_features)
+        hidden = self._feed_forward(observations, frame_features)
         if self.memory is None:
             return hidden, hidden.new_empty(len(hidden), 0)
         sequences = observations.sequences
         if sequences is None:
             sequences = Sequences.single(hidden.new_zeros(len(hidden), self.state_size))
-        recalled: tuple[Tensor, Tensor] = self.memory(hidden, sequences)
-        return recalled
+        outputs: tuple[Tensor, Tensor] = self.memory(hidden, sequences)
+        return outputs
 
-    def _react(self, observations: Observations, frame_features: Tensor | None) -> Tensor:
-        """What the trunk says (B, ...) of each observation by itself."""
+    def _feed_forward(self, observations: Observations, frame_features: Tensor | None) -> Tensor:
+        """Outputs of the trunk (B, ...) for each observation by itself."""
         if frame_features is None:
             frame_features = self.encode_frames(observations.frames)
             if frame_features is not None and observations.frame_index is not None:
@@ -155,7 +155,7 @@ def _orthogonal(layer: nn.Linear, gain: float) -> nn.Linear:
 
 
 def precision(settings: NetworkSettings, device: torch.device) -> AbstractContextManager[None]:
-    """Where encoders and hidden layers calculate as the settings say."""
+    """Context where encoders and hidden layers calculate as the settings say."""
     # Entering autocast costs time even where it is not enabled.
     lowered = settings.precision == "bfloat16"
     return torch.autocast(device.type, torch.bfloat16) if lowered else nullcontext()

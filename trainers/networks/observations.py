@@ -29,8 +29,8 @@ class Observations:
         frames: by name, images (U, H, W, C) in their own type.
         vectors: by name, (B, n).
         frame_index: (B,) which of the U frames belongs to each; None: U = B, in this order.
-        sequences: which of them follow each other, and what is remembered before; None: each is
-            the first of its episode. Only networks with memory ask.
+        sequences: which of them follow each other, and the hidden state before; None: each is the
+            first of its episode. Only networks with memory ask.
     """
 
     frames: dict[str, Tensor]

@@ -15,7 +15,7 @@ class PolicyNetwork(nn.Module):
 
     Attributes:
         sees: names of the observations that acting needs.
-        state_size: m, the numbers that it remembers from step to step; 0 without memory.
+        state_size: m, length of the hidden state; 0 without memory.
     """
 
     sees: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Memory of what was observed before: a recurrent layer, and the sequences it runs through."""
+"""Memory of earlier observations: a recurrent layer, and the sequences it runs through."""
 
 from __future__ import annotations
 
@@ -32,17 +32,16 @@ class Sequences:
 
     Attributes:
         lengths: (S,) int64 on the CPU; they add up to the number of observations.
-        state: (S, m) what is remembered before the first observation of each; zeros where an
-            episode begins.
+        hidden_state: (S, m) before the first observation of each; zeros where an episode begins.
     """
 
     lengths: Tensor
-    state: Tensor
+    hidden_state: Tensor
 
     @classmethod
-    def single(cls, state: Tensor) -> Sequences:
-        """One observation for each row of a state (B, m)."""
-        return cls(torch.ones(len(state), dtype=torch.int64), state)
+    def single(cls, hidden_state: Tensor) -> Sequences:
+        """One observation for each row of a hidden state (B, m)."""
+        return cls(torch.ones(len(hidden_state), dtype=torch.int64), hidden_state)
 
 
 class Recurrent(nn.Module):
@@ -54,7 +53,7 @@ class Recurrent(nn.Module):
 
     Attributes:
         features_dim: length of the vectors it returns.
-        state_size: m, the numbers that it remembers; of an LSTM hidden and cell state.
+        state_size: m, length of the hidden state; an LSTM's holds its cell state, too.
     """
 
     def __init__(self, inputs: int, settings: MemorySettings):
@@ -75,16 +74,17 @@ class Recurrent(nn.Module):
             sequences: S of them, of B steps together.
 
         Returns:
-            What comes out at each step, (B, features_dim), and the states (S, m) after the last
-            steps.
+            Outputs of all steps (B, features_dim), and the hidden states (S, m) after the last
+            ones.
         """
         rows, counts, order = _in_step(sequences.lengths)
         rows, order = rows.to(vectors.device), order.to(vectors.device)
         packed = PackedSequence(vectors[rows], counts, order, order.argsort())
-        before = [part.contiguous() for part in sequences.state[None].chunk(self._parts, dim=-1)]
-        outputs, after = self.layer(packed, tuple(before) if self._parts > 1 else before[0])
-        state = torch.cat(after, dim=-1) if self._parts > 1 else after
-        return outputs.data[rows.argsort()], state[0]
+        parts = sequences.hidden_state[None].chunk(self._parts, dim=-1)
+        before = tuple(part.contiguous() for part in parts)
+        outputs, after = self.layer(packed, before if self._parts > 1 else before[0])
+        hidden_state = torch.cat(after, dim=-1) if self._parts > 1 else after
+        return outputs.data[rows.argsort()], hidden_state[0]
 
 
 def number_sequences(done: NDArray[np.bool_], length: int) -> NDArray[np.int64]:
@@ -105,7 +105,7 @@ def number_sequences(done: NDArray[np.bool_], length: int) -> NDArray[np.int64]:
 
 
 def _latest(events: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """When the latest event up to each time was, (T, N); each column begins with one."""
+    """Times (T, N) of the latest event up to each time; each column begins with one."""
     time = np.arange(len(events))[:, None]
     return np.maximum.accumulate(np.where(events, time, 0))
 

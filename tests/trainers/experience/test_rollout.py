@@ -130,7 +130,7 @@ def test_sequences_come_in_the_order_of_time_with_what_was_remembered_before_the
     sequences = rollout.observations(rows).sequences
     assert sequences is not None
     assert sequences.lengths.tolist() == [2, 3, 5, 3, 2]
-    assert sequences.state.flatten().tolist() == [0, 1, 2, 6, 10]
+    assert sequences.hidden_state.flatten().tolist() == [0, 1, 2, 6, 10]
 
 
 @given(st.integers(1, 20), st.integers(0, 2**31))
@@ -142,7 +142,7 @@ def test_a_sequence_is_cut_at_most_where_a_minibatch_ends(size: int, seed: int) 
         sequences = rollout.observations(rows).sequences
         assert sequences is not None
         parts = rows.split(sequences.lengths.tolist())
-        assert [part[0] for part in parts] == sequences.state.flatten().tolist()
+        assert [part[0] for part in parts] == sequences.hidden_state.flatten().tolist()
         assert len({int(SEQUENCES[part[0]]) for part in parts}) == len(parts)
         pieces += parts
     assert len(pieces) <= 5 + len(batches) - 1

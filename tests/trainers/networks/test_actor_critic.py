@@ -173,9 +173,9 @@ def test_a_separate_critic_remembers_by_itself(make_factory: MakeFactory) -> Non
     sequences = observations.sequences
     assert sequences is not None
     for part, same in ((slice(0, 8), (False, True)), (slice(8, 16), (True, False))):
-        other = sequences.state.clone()
+        other = sequences.hidden_state.clone()
         other[:, part] += 1.0
-        changed = replace(observations, sequences=replace(sequences, state=other))
+        changed = replace(observations, sequences=replace(sequences, hidden_state=other))
         distribution_now, values_now, _ = policy.step(changed)
         assert (
             torch.equal(distribution_now.mean, distribution.mean),

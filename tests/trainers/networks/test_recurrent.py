@@ -47,7 +47,9 @@ def plain_loop(
     cell = (nn.LSTMCell if kind == "lstm" else nn.GRUCell)(INPUTS, UNITS).double()
     weights = {name.removesuffix("_l0"): p for name, p in layer.layer.named_parameters()}
     outputs, states = [], []
-    for part, state in zip(vectors.split(sequences.lengths.tolist()), sequences.state, strict=True):
+    for part, state in zip(
+        vectors.split(sequences.lengths.tolist()), sequences.hidden_state, strict=True
+    ):
         hidden: Any = state[None] if kind == "gru" else (state[None, :UNITS], state[None, UNITS:])
         for vector in part:
             hidden = torch.func.functional_call(cell, weights, (vector[None], hidden))
@@ -64,7 +66,7 @@ def test_it_says_what_a_plain_loop_says_and_has_its_gradients(
 ) -> None:
     layer = recurrent(kind, seed)
     vectors, sequences = some(layer, lengths, grad=True)
-    leaves = [vectors, sequences.state, *layer.parameters()]
+    leaves = [vectors, sequences.hidden_state, *layer.parameters()]
     answers = []
     for run in (layer, lambda *given: plain_loop(kind, layer, *given)):
         outputs, states = run(vectors, sequences)
@@ -89,7 +91,7 @@ def test_a_sequence_cut_in_two_goes_on_from_its_state(
     parts = list(zip(vectors.split(lengths), whole.split(lengths), cuts, strict=True))
     first, state = layer(
         torch.cat([part[:cut] for part, _, cut in parts]),
-        Sequences(torch.tensor(cuts), sequences.state),
+        Sequences(torch.tensor(cuts), sequences.hidden_state),
     )
     torch.testing.assert_close(first, torch.cat([out[:cut] for _, out, cut in parts]))
     left = torch.tensor(lengths) - torch.tensor(cuts)
@@ -106,7 +108,7 @@ def test_a_sequence_cut_in_two_goes_on_from_its_state(
 def test_single_observations_are_sequences_of_one_step(kind: str) -> None:
     layer = recurrent(kind)
     vectors, sequences = some(layer, [1, 1, 1])
-    outputs, state = layer(vectors, Sequences.single(sequences.state))
+    outputs, state = layer(vectors, Sequences.single(sequences.hidden_state))
     expected, expected_state = plain_loop(kind, layer, vectors, sequences)
     torch.testing.assert_close(outputs, expected)
     torch.testing.assert_close(state, expected_state)
