@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from curricula.samplers import ParameterValue
 
 State = dict[str, Any]
-"""Everything that a curriculum remembers, made of what JSON knows."""
+"""Everything that a curriculum keeps from step to step, made of what JSON knows."""
 
 
 @dataclass(frozen=True)
@@ -51,29 +51,29 @@ class Curriculum(Protocol):
 
     @property
     def lesson_count(self) -> int:
-        """How many lessons there are."""
+        """Number of lessons."""
         ...
 
     def initial_state(self) -> State:
-        """Return the state at the start of a run."""
+        """State at the start of a run."""
         ...
 
     def advance(self, state: State, episodes: FinishedEpisodes) -> State:
-        """Return the state after some episodes; ``state`` itself is left as it is."""
+        """State after some episodes; ``state`` itself is left as it is."""
         ...
 
     def lesson(self, state: State) -> int:
-        """Return the index of the current lesson, from 0."""
+        """Index of the current lesson, from 0."""
         ...
 
     def lesson_name(self, state: State) -> str | None:
-        """Return what the log calls the current lesson next to its number, if anything."""
+        """Name of the current lesson, which the log shows next to its number; None without one."""
         ...
 
     def parameters(self, state: State) -> dict[str, ParameterValue]:
-        """Return the environment parameters of the current lesson: numbers or samplers."""
+        """Environment parameters of the current lesson: numbers or samplers."""
         ...
 
     def final_parameters(self) -> dict[str, ParameterValue]:
-        """Return the environment parameters of the last lesson, on which policies are judged."""
+        """Environment parameters of the last lesson, on which policies are judged."""
         ...

@@ -50,7 +50,7 @@ class Interpolation(BaseModel, frozen=True, extra="forbid"):
         return self
 
     def values(self, count: int) -> tuple[float, ...]:
-        """Return ``count`` values, the ends exact; a single value is the last one.
+        """``count`` values, the ends exact; a single value is the last one.
 
         Args:
             count: How many values, 0 or more.

@@ -1,4 +1,4 @@
-"""How the curriculum `lessons` is written, and what it means in full."""
+"""Settings of the curriculum `lessons`, and their expansion into every lesson in full."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -137,7 +137,7 @@ class LessonsSettings(BaseModel, frozen=True, extra="forbid"):
             raise ValueError("the lessons are all the same: give them 'parameters'")
 
     def expand(self) -> tuple[Lesson, ...]:
-        """Return all lessons, each with all of its parameters."""
+        """All lessons, each with all of its parameters."""
         if self.lessons is None:
             return self._expand_compact_form()
         expanded: list[Lesson] = []

@@ -49,15 +49,15 @@ class Lessons:
 
     @property
     def lesson_count(self) -> int:
-        """How many lessons there are."""
+        """Number of lessons."""
         return len(self._lessons)
 
     def initial_state(self) -> State:
-        """Return the state at the start of a run: the first lesson, no episodes."""
+        """State at the start of a run: the first lesson, no episodes."""
         return _begin(0)
 
     def advance(self, state: State, episodes: FinishedEpisodes) -> State:
-        """Return the state after some episodes; ``state`` itself is left as it is.
+        """State after some episodes; ``state`` itself is left as it is.
 
         Raises:
             ValueError: The state's lesson is not one of these lessons.
@@ -73,7 +73,7 @@ class Lessons:
         return self._smooth(state, threshold, measured.astype(float).tolist())
 
     def lesson(self, state: State) -> int:
-        """Return the index of the current lesson, from 0.
+        """Index of the current lesson, from 0.
 
         Raises:
             ValueError: The state's lesson is not one of these lessons.
@@ -87,15 +87,15 @@ class Lessons:
         return index
 
     def lesson_name(self, state: State) -> str | None:
-        """Return what the log calls the current lesson next to its number, if anything."""
+        """Name of the current lesson, which the log shows next to its number; None without one."""
         return self._lessons[self.lesson(state)].name
 
     def parameters(self, state: State) -> dict[str, ParameterValue]:
-        """Return the environment parameters of the current lesson: the same names in each."""
+        """Environment parameters of the current lesson: the same names in each."""
         return dict(self._lessons[self.lesson(state)].parameters)
 
     def final_parameters(self) -> dict[str, ParameterValue]:
-        """Return the environment parameters of the last lesson."""
+        """Environment parameters of the last lesson."""
         return dict(self._lessons[-1].parameters)
 
     def _pass_thresholds(self, index: int, run_fraction: float) -> int:

@@ -6,5 +6,5 @@ from trainers.hookspecs import hookimpl
 
 @hookimpl
 def ventosa_curricula() -> dict[str, type]:
-    """Return the built-in curricula by name."""
+    """Built-in curricula by name."""
     return {"lessons": Lessons}

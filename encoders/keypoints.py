@@ -135,7 +135,7 @@ class Keypoints(nn.Module):
     def _gather(
         self, attention: torch.Tensor, points: torch.Tensor, values: torch.Tensor
     ) -> list[torch.Tensor]:
-        """What K maps (B, K, n) attend to: mean points, their covariances, mean values."""
+        """Mean points, their covariances and mean values under K attention maps (B, K, n)."""
         rows, columns = torch.triu_indices(COORDINATES, COORDINATES, device=points.device)
         squares = points[..., rows] * points[..., columns]
         means = attention @ torch.cat([points, squares, values], dim=-1)

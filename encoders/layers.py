@@ -1,4 +1,4 @@
-"""What the encoders share: sizes of feature maps, convolutions, dense layers."""
+"""Parts that the encoders share: sizes of feature maps, convolutions, dense layers."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class Figure:
         return replace(self, key=f"first_action_{self.name}", label=f"first action {self.label}")
 
     def summarize(self, values: NDArray[Any]) -> float | dict[str, float]:
-        """What a report says of the metric (k,) of k episodes."""
+        """Entry of a report, made of the metric (k,) of k episodes."""
         if self.summary == "mean":
             return float(np.mean(values))
         return {"median": float(np.median(values)), "p95": float(np.percentile(values, 95))}
@@ -69,7 +69,7 @@ def error(metric: str, label: str, unit: str, scale: float = 1.0) -> Figure:
 
 
 SUCCESS = rate("success", "success")
-"""What every environment may report, and need not declare."""
+"""Figure that every environment may report, and need not declare."""
 
 
 class PhysicalCheck(Protocol):
@@ -108,7 +108,7 @@ class EvaluationReport(Protocol):
 
 
 class Evaluator:
-    """How an environment's policies are judged. What is not declared is left out.
+    """Rules by which an environment's policies are judged. What is not declared is left out.
 
     Attributes:
         figures: of the environment's episode metrics. Success needs no declaration.
@@ -123,7 +123,7 @@ class Evaluator:
     check_name: str = "check"
 
     def physical_check(self, *, window: bool = False) -> PhysicalCheck:
-        """What first actions are tried out in.
+        """Physical check that first actions are tried out in.
 
         Args:
             window: show it, as it goes.
@@ -134,7 +134,7 @@ class Evaluator:
         raise ValueError("the environment has no physical check")
 
     def pictures(self) -> EvaluationReport:
-        """What draws first actions.
+        """Report that draws first actions.
 
         Raises:
             ValueError: there is nothing to draw, or something needed for it is not installed.

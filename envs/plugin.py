@@ -7,5 +7,5 @@ from trainers.hookspecs import hookimpl
 
 @hookimpl
 def ventosa_environments() -> dict[str, type]:
-    """Return the built-in environments by name."""
+    """Built-in environments by name."""
     return {"grasp": GraspVectorEnv, "gymnasium": GymEnvironment}

@@ -8,7 +8,7 @@ from trainers.hookspecs import hookimpl
 
 @hookimpl
 def ventosa_rewards() -> dict[str, type]:
-    """Return the built-in rewards by name."""
+    """Built-in rewards by name."""
     return {
         "touch": Touch,
         "collision": Collision,

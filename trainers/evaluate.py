@@ -84,7 +84,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def _generic_options() -> argparse.ArgumentParser:
-    """What every environment's policies can be evaluated with."""
+    """Options that every environment's policies can be evaluated with."""
     parser = argparse.ArgumentParser(
         prog=PROGRAM, usage=f"{PROGRAM} POLICY [KEY=VALUE ...] [options]", add_help=False
     )

@@ -1,4 +1,4 @@
-"""How good a policy is, in episodes it has never seen."""
+"""Evaluation of a policy, in episodes it has never seen."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ FIRST_ACTION, WHOLE_EPISODE = 0, 1
 
 
 class ActingPolicy(Protocol):
-    """What can be evaluated."""
+    """A policy that can be evaluated."""
 
     def predict(
         self,
@@ -59,7 +59,7 @@ class ActingPolicy(Protocol):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What is known of a policy.
+    """Result of an evaluation.
 
     Attributes:
         report: plain data, see `evaluate_policy`.
@@ -135,7 +135,7 @@ def find_run(
 
 @contextmanager
 def _asked_for(what: str) -> Iterator[None]:
-    """What can't be had of what is asked for is the user's mistake."""
+    """Turns a ValueError about something that was asked for into the user's mistake."""
     try:
         yield
     except ValueError as error:

@@ -70,7 +70,7 @@ class HeldOutEvaluation:
 
     @property
     def score(self) -> float:
-        """How good the policy was at the last evaluation; more is better."""
+        """Score of the policy at the last evaluation; more is better."""
         return next(float(self.latest[name]) for name in BEST_BY if name in self.latest)
 
     @property

@@ -1,4 +1,4 @@
-"""What a plugin may provide: five hooks, one per kind of component.
+"""The hooks of plugins: five, one per kind of component.
 
 A plugin is a module, named by an entry point of the group `ventosa`, that implements one or more
 of these hooks with `hookimpl`. Each hook returns a mapping from the component's name, which the run

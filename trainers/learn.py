@@ -103,7 +103,7 @@ def stop_on_signals() -> Iterator[Stop]:
 
 
 def shadowed_packages() -> str | None:
-    """What is wrong if another distribution's package hides one of ours; None if nothing is."""
+    """Message if another distribution's package hides one of ours; None if nothing is."""
     home = Path(__file__).resolve().parents[1]
     for package in PACKAGES:
         spec = importlib.util.find_spec(package)

@@ -8,5 +8,5 @@ from trainers.hookspecs import hookimpl
 
 @hookimpl
 def ventosa_trainers() -> dict[str, type]:
-    """Return the built-in algorithms by name."""
+    """Built-in algorithms by name."""
     return {"ddpg": DDPG, "ppo": PPO, "trpo": TRPO}

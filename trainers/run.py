@@ -96,7 +96,7 @@ def _timers_written(directory: Path) -> Iterator[None]:
 
 @contextmanager
 def _held_out(session: Session, run: RunSettings, start: int) -> Iterator[HeldOutEvaluation | None]:
-    """What evaluates while the run learns, if the run file asks for it."""
+    """Evaluation while the run learns; None unless the run file asks for it."""
     if run.evaluation is None:
         yield None
         return

@@ -89,7 +89,7 @@ class Session:
 
     @property
     def position(self) -> RunPosition:
-        """How far the run has come."""
+        """Position of the run."""
         lesson = None if self.curriculum is None else self.lesson
         return RunPosition(self.env_runner.step_count, lesson, self.lesson_count)
 
@@ -203,7 +203,7 @@ def _build(component: Component, path: str, *rest: Any) -> Any:
 
 
 def build_factory(run: RunSettings, registries: Registries, env: Environment) -> NetworkFactory:
-    """What builds the networks of the run."""
+    """Factory of the run's networks."""
     return network_factory(
         env.single_observation_space,
         env.single_action_space,

@@ -20,7 +20,7 @@ from trainers.session import Session
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run ended.
+    """End of a run.
 
     Attributes:
         finished: False if it was stopped, and can go on.
@@ -121,7 +121,7 @@ class Training:
         return path
 
     def _score(self, step: int) -> float | None:
-        """What the best checkpoint is chosen by.
+        """Score that the best checkpoint is chosen by.
 
         By an evaluation of this very policy where there are evaluations. By the reward in training
         otherwise; but those of different lessons can't be compared, and the newest counts.

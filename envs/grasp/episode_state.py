@@ -1,4 +1,4 @@
-"""The running episodes: what a batch of grasp environments remembers from step to step."""
+"""The running episodes: the state of a batch of grasp environments from step to step."""
 
 from __future__ import annotations
 

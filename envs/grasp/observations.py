@@ -1,4 +1,4 @@
-"""What the grasp environment lets be observed."""
+"""Observations of the grasp environment."""
 
 from __future__ import annotations
 

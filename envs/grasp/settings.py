@@ -77,7 +77,7 @@ class Camera(BaseModel, frozen=True, extra="forbid"):
 
 
 class Workspace(BaseModel, frozen=True, extra="forbid"):
-    """What an action of -1 to 1 maps onto: the tooltip's position and the tool's yaw."""
+    """Range that actions from -1 to 1 map onto: the tooltip's position and the tool's yaw."""
 
     x_m: Range = Field((0.82, 1.35), description="Tooltip x, forward from the robot's base.")
     y_m: Range = Field((-0.45, 0.45), description="Tooltip y, to the left.")

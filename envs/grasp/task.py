@@ -60,7 +60,7 @@ def goal_middle_m(goal: Goal) -> Floats:
 
 @dataclass(frozen=True)
 class EpisodeProgress(Batch):
-    """What has happened in N running episodes; arrays (N,)."""
+    """Progress of N running episodes; arrays (N,)."""
 
     steps: NDArray[np.int64]
     touched: Bools

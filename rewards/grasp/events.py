@@ -1,4 +1,4 @@
-"""Rewards paid when something happens (the paper's section "Rewards design" and its baseline)."""
+"""Rewards for events (the paper's section "Rewards design" and its baseline)."""
 
 from typing import ClassVar
 
@@ -10,7 +10,7 @@ from rewards.grasp.transition import Bools, GraspTransition
 
 
 class Touch:
-    """Paid the first time in an episode that the cup touches the target block."""
+    """Reward for the first time in an episode that the cup touches the target block."""
 
     snapshot: ClassVar[type] = GraspTransition
 
@@ -25,8 +25,10 @@ class Touch:
         self._settings = settings
 
     def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
-        """Return the rewards, (N,)."""
-        return _pay_once(self._settings.amount, transition.touched, transition.touched_before)
+        """Rewards (N,)."""
+        return _reward_first_time(
+            self._settings.amount, transition.touched, transition.touched_before
+        )
 
 
 class Collision:
@@ -45,12 +47,12 @@ class Collision:
         self._settings = settings
 
     def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
-        """Return the rewards, (N,)."""
+        """Rewards (N,)."""
         return np.where(transition.collided, self._settings.amount, 0.0)
 
 
 class Position:
-    """Paid the first time in an episode that the tooltip is inside the goal region."""
+    """Reward for the first time in an episode that the tooltip is inside the goal region."""
 
     snapshot: ClassVar[type] = GraspTransition
 
@@ -65,14 +67,14 @@ class Position:
         self._settings = settings
 
     def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
-        """Return the rewards, (N,)."""
-        return _pay_once(
+        """Rewards (N,)."""
+        return _reward_first_time(
             self._settings.amount, transition.position_right, transition.position_right_before
         )
 
 
 class Rotation:
-    """Paid the first time in an episode that rotation and position are both right."""
+    """Reward for the first time in an episode that rotation and position are both right."""
 
     snapshot: ClassVar[type] = GraspTransition
 
@@ -87,14 +89,14 @@ class Rotation:
         self._settings = settings
 
     def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
-        """Return the rewards, (N,)."""
-        return _pay_once(
+        """Rewards (N,)."""
+        return _reward_first_time(
             self._settings.amount, transition.rotation_right, transition.rotation_right_before
         )
 
 
 class Sparse(Rotation):
-    """The paper's baseline, used alone: paid once, when position and rotation are both right."""
+    """The paper's baseline, used alone: the first time position and rotation are both right."""
 
     class Settings(Rotation.Settings, frozen=True, extra="forbid"):
         """Settings of the reward `sparse`."""
@@ -104,6 +106,6 @@ class Sparse(Rotation):
         )
 
 
-def _pay_once(amount: float, now: Bools, before: Bools) -> NDArray[np.float64]:
-    """Return the amount where something is so for the first time in an episode; all (N,)."""
+def _reward_first_time(amount: float, now: Bools, before: Bools) -> NDArray[np.float64]:
+    """Rewards (N,): the amount where something is so for the first time in an episode."""
     return np.where(now & ~before, amount, 0.0)

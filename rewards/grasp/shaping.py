@@ -1,4 +1,4 @@
-"""Rewards paid at every step, which tell how well an action went (the paper's "Rewards design")."""
+"""Rewards of every step, which tell how well an action went (the paper's "Rewards design")."""
 
 from typing import ClassVar, Literal
 
@@ -10,7 +10,7 @@ from rewards.grasp.transition import GraspTransition
 
 
 class Approach:
-    """Pays motion towards the target: gain * (v . n), the paper's equations `dir_func` and `fmt`.
+    """Reward for motion towards the target: gain * (v . n), the paper's `dir_func` and `fmt`.
 
     v is the tooltip's displacement over the action (m), or its mean velocity (m/s); n is the unit
     vector from the *new* tooltip to the grasp point. The distance to a point is convex, so v . n
@@ -38,7 +38,7 @@ class Approach:
         self._settings = settings
 
     def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
-        """Return the rewards, (N,); 0 where the tooltip is on the target or no time passed."""
+        """Rewards (N,); 0 where the tooltip is on the target or no time passed."""
         velocity = transition.tooltip_m - transition.previous_tooltip_m
         if self._settings.velocity == "per_second":
             velocity = _divide(velocity, transition.duration_s[:, None])
@@ -48,7 +48,7 @@ class Approach:
 
 
 class Facing:
-    """Pays a cup turned towards the face: -gain * (n_block . z_tool), the paper's `or_func`.
+    """Reward for a cup turned towards the face: -gain * (n_block . z_tool), the paper's `or_func`.
 
     Positive when the tool looks at the face, which is when its axis is opposite to the normal.
     """
@@ -66,12 +66,12 @@ class Facing:
         self._settings = settings
 
     def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
-        """Return the rewards, (N,)."""
+        """Rewards (N,)."""
         return -self._settings.gain * _dot(transition.target_normal, transition.tool_axis)
 
 
 class Precision:
-    """Pays exactness: -gain * sum_i log(1 + (e_i / s_i)^2) / 2 over four errors e_i.
+    """Reward for exactness: -gain * sum_i log(1 + (e_i / s_i)^2) / 2 over four errors e_i.
 
     The errors are those sideways, up, in the gap (to `gap_m`) and in yaw. Well over its scale s_i
     an error costs its logarithm: halving it pays the same whether it is large or small, so that the
@@ -103,7 +103,7 @@ class Precision:
         self._settings = settings
 
     def __call__(self, transition: GraspTransition) -> NDArray[np.float64]:
-        """Return the rewards, (N,), never positive."""
+        """Rewards (N,), never positive."""
         settings = self._settings
         offset = (transition.offset_m - [0.0, 0.0, settings.gap_m]) / settings.position_scale_m
         yaw = transition.yaw_error_rad / np.radians(settings.yaw_scale_deg)
@@ -112,11 +112,11 @@ class Precision:
 
 
 def _dot(left: NDArray, right: NDArray) -> NDArray[np.float64]:
-    """Return the inner products, (N,), of two arrays of vectors, (N, 3)."""
+    """Inner products (N,) of two arrays of vectors, (N, 3)."""
     return np.einsum("ni,ni->n", left, right, dtype=np.float64)
 
 
 def _divide(vectors: NDArray, by: NDArray) -> NDArray[np.float64]:
-    """Divide vectors, (N, 3), by numbers, (N, 1); a division by zero gives the zero vector."""
+    """Vectors (N, 3) over numbers (N, 1); a division by zero gives the zero vector."""
     quotient = np.zeros(vectors.shape, dtype=np.float64)
     return np.divide(vectors, by, out=quotient, where=by > 0)

@@ -1,4 +1,4 @@
-"""What a reward sees: one step of N environments."""
+"""The snapshot that rewards are computed from: one step of N environments."""
 
 from dataclasses import dataclass
 

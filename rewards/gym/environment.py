@@ -10,7 +10,7 @@ from rewards.gym.transition import GymTransition
 
 
 class EnvironmentReward:
-    """What the gymnasium environment pays by itself."""
+    """The gymnasium environment's own reward."""
 
     snapshot: ClassVar[type] = GymTransition
 

@@ -1,4 +1,4 @@
-"""What a reward sees of any gymnasium environment: one step of N environments."""
+"""The snapshot of any gymnasium environment that rewards are computed from: one step of N."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

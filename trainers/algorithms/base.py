@@ -13,7 +13,7 @@ from trainers.networks.policy_network import PolicyNetwork
 
 
 class TrainerSettings(BaseModel, frozen=True, extra="forbid"):
-    """How long to train, and how often to report and to save."""
+    """Length of the training, and intervals of reports and checkpoints."""
 
     max_steps: int = Field(
         500_000, ge=1, description="Steps of the whole run, over all environments."

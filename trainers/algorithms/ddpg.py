@@ -71,7 +71,7 @@ class DDPG(OffPolicyAlgorithm):
         }
         super().__init__(policy, settings, parameters, env_runner, generator, device)
         self._noise: Noise = hyper.noise.build(self._shape, device)
-        # Without a future there is no value to estimate, nor anything to look at.
+        # Without a future there is no value to estimate, nor anything to observe.
         self._targets = self._bootstrapped_returns if hyper.gamma else self._buffer.rewards
 
     @staticmethod
@@ -107,7 +107,7 @@ class DDPG(OffPolicyAlgorithm):
         return super()._schedule(run_fraction) | {"Policy/Noise": sigma}
 
     def _improve_critic(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
-        """Descends the mean of (Q(s, a) - y)^2 (Lillicrap et al. 2015, algorithm 1)."""
+        """Optimizer step on the mean of (Q(s, a) - y)^2 (Lillicrap et al. 2015, algorithm 1)."""
         online = self.policy.online
         targets = self._targets(indices)
         observations = self._augment(self._buffer.observations(indices, online.critic_sees))
@@ -117,7 +117,7 @@ class DDPG(OffPolicyAlgorithm):
         return {"Losses/Value Loss": loss, "Policy/Q Value": values.mean()}
 
     def _improve_actor(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
-        """Descends the mean of -Q(s, mu(s))."""
+        """Optimizer step on the mean of -Q(s, mu(s))."""
         online = self.policy.online
         observations = self._augment(self._buffer.observations(indices, self._seen))
         loss = -online.value(observations, online.act(observations)).mean()

@@ -59,7 +59,7 @@ class Noise(Protocol):
     """Noise of sigma 1, for N environments at once.
 
     Attributes:
-        state: what is remembered from step to step, (N, A) or empty.
+        state: of the process, (N, A); empty for noise that has none.
     """
 
     state: Tensor

@@ -1,4 +1,4 @@
-"""What algorithms share that learn from the present policy's own experience, as PPO does."""
+"""Common parts of algorithms that learn from the present policy's own experience, as PPO does."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from trainers.networks.actor_critic import ActorCritic
 
 
 class OnPolicyHyperparameters(BaseModel, frozen=True, extra="forbid"):
-    """Hyper-parameters of collecting, estimating advantages and descending gradients."""
+    """Hyper-parameters of collecting, estimating advantages and optimizer steps."""
 
     batch_size: int = Field(512, ge=1, description="Transitions in one step of gradient descent.")
     buffer_size: int = Field(8192, ge=1, description="Transitions collected before an update.")

@@ -64,7 +64,7 @@ class PPOSettings(TrainerSettings, frozen=True, extra="forbid"):
 
 @dataclass(frozen=True)
 class _Scheduled:
-    """What changes over the run, as it is in one update."""
+    """Scheduled hyper-parameters, as they are in one update."""
 
     learning_rate: float
     critic_learning_rate: float
@@ -163,7 +163,7 @@ class PPO(OnPolicyAlgorithm):
                 if weight:  # the gradient of what weighs nothing costs as much as any
                     loss = loss + weight * term
             self._optimizer_step(loss)
-            # All at once: on an accelerator each look at a number waits for all that is under way.
+            # All at once: on an accelerator each number read waits for all that is under way.
             statistics = torch.stack((divergence, clip_fraction, policy_loss, value_loss, entropy))
             means = statistics.tolist()
             averager.add(dict(zip(STATISTICS, means, strict=True)), len(rows))

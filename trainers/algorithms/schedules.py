@@ -1,4 +1,4 @@
-"""How a hyper-parameter changes over a run, as a setting."""
+"""Course of a hyper-parameter over a run, as a setting."""
 
 from typing import Any, Literal
 
@@ -67,7 +67,7 @@ class Schedule(BaseModel, frozen=True, extra="forbid"):
         return given
 
     def value(self, initial: float, run_fraction: float) -> float:
-        """Return the scheduled value.
+        """The scheduled value.
 
         Args:
             initial: The value at the start of the run.

@@ -200,7 +200,7 @@ class TRPO(OnPolicyAlgorithm):
 def surrogate_gain(
     distribution: Distribution, actions: Tensor, old_log_probs: Tensor, advantages: Tensor
 ) -> Tensor:
-    """What the policy promises over the old one (Schulman et al. 2015, eq. 14), by its samples.
+    """Gain that the policy promises over the old one (Schulman et al. 2015, eq. 14), by samples.
 
     Args:
         distribution: the policy at B observations.
@@ -273,7 +273,7 @@ def kl_constrained_step(
 
 @dataclass(frozen=True)
 class LineSearch:
-    """What became of a step.
+    """Result of a line search.
 
     Attributes:
         gain: of the policy that the search ended with.
@@ -324,7 +324,7 @@ def line_search(
 
 
 def _differentiable_twice(policy: ActorCritic) -> AbstractContextManager[None]:
-    """Where gradients of the policy have gradients: cuDNN's recurrent layers have none."""
+    """Context where gradients of the policy have gradients: cuDNN's recurrent layers have none."""
     return torch.backends.cudnn.flags(enabled=False) if policy.state_size else nullcontext()
 
 

@@ -1,4 +1,4 @@
-"""Where a run's time goes: a tree of named timers, as ML-Agents writes it to timers.json."""
+"""Times of a run's parts: a tree of named timers, as ML-Agents writes it to timers.json."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def network_factory(
     encoders: Mapping[str, Component],
     registry: Registry,
 ) -> NetworkFactory:
-    """What builds the networks of a run, or of a saved policy.
+    """Factory of the networks of a run, or of a saved policy.
 
     Args:
         observation_space: of one environment.

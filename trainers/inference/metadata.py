@@ -1,4 +1,4 @@
-"""What a saved policy says of itself: its spaces, and the plugins that it needs."""
+"""Metadata of a saved policy: its spaces, and the plugins that it needs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class _File(BaseModel, frozen=True, extra="forbid"):
 
 @dataclass(frozen=True)
 class Metadata:
-    """What goes in and comes out of a policy.
+    """Spaces and components of a policy.
 
     Attributes:
         observation_space: of one environment.
@@ -57,7 +57,7 @@ class Metadata:
 
     @classmethod
     def of_run(cls, run: RunSettings, registries: Registries, env: Environment) -> Metadata:
-        """What a run's policies say of themselves."""
+        """Metadata of a run's policies."""
         encoders, trainers = registries.encoders, registries.trainers
         return cls(
             env.single_observation_space,
@@ -85,7 +85,7 @@ class Metadata:
 
     @classmethod
     def from_json(cls, content: bytes | str) -> Metadata:
-        """What a file holds.
+        """Metadata that a file holds.
 
         Raises:
             ValueError: it is not such a file's content.

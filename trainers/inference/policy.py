@@ -142,7 +142,7 @@ class Policy:
 
 
 def find_metadata(folder: Path) -> Metadata:
-    """What a policy says of itself.
+    """Metadata of a policy.
 
     Where it was saved before policies did, its environment is built to be asked.
 

@@ -1,4 +1,4 @@
-"""What a run tells the world: TensorBoard and `status.json`."""
+"""Files that a run reports to: TensorBoard's and `status.json`."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ Metrics = Mapping[str, NDArray[Any]]
 
 
 def report_figures(evaluator: Evaluator) -> dict[str, Figure]:
-    """How people read a report's entries, by their keys; what is not here is a plain number."""
+    """Figures of a report's entries, by their keys; what is not here is a plain number."""
     name, label = evaluator.check_name, evaluator.check_name.replace("_", " ")
     figures = (
         Figure("reward", "reward"),
@@ -44,7 +44,7 @@ def first_action_figures(evaluator: Evaluator) -> tuple[Figure, ...]:
 
 
 def summaries(figures: Sequence[Figure], metrics: Metrics) -> dict[str, Any]:
-    """What a report says of episodes' metrics (k,)."""
+    """Entries of a report, made of episodes' metrics (k,)."""
     for figure in figures:
         if figure.metric not in (*metrics, SUCCESS.metric):
             raise UserError(

@@ -1,4 +1,4 @@
-"""What a run tells its user: TensorBoard, status.json and the terminal."""
+"""Reports of a run: TensorBoard, status.json and the terminal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SUMMARIES_PER_PICTURE = 10
 
 @dataclass(frozen=True)
 class RunPosition:
-    """How far a run has come.
+    """Position of a run.
 
     Attributes:
         step: environment steps taken.
@@ -101,7 +101,7 @@ class Summary:
         self._averager.add({name: float(mean) for name, mean in means.items()}, len(episodes))
 
     def note_checkpoint(self, path: Path) -> None:
-        """Remembers the newest checkpoint, for status.json."""
+        """Keeps the newest checkpoint, for status.json."""
         self._checkpoint = str(path)
 
     def report(
@@ -123,7 +123,7 @@ class Summary:
             display.update(self._line(position))
 
     def note_evaluation(self, report: Mapping[str, Any]) -> None:
-        """Remembers the latest evaluation, for status.json."""
+        """Keeps the latest evaluation, for status.json."""
         self._evaluation = dict(report)
 
     def status(self, position: RunPosition, state: str, reason: str | None = None) -> None:

@@ -1,4 +1,4 @@
-"""What a user sees while a run goes on: a live panel on a terminal, plain lines anywhere else."""
+"""Console output of a run: a live panel on a terminal, plain lines anywhere else."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WIDEST_PANEL = 100
 
 @dataclass(frozen=True)
 class RunStatus:
-    """Where a run stands.
+    """Status of a run.
 
     Attributes:
         step: environment steps taken.
@@ -108,7 +108,7 @@ def format_duration(duration_s: float) -> str:
 
 
 class _BaseDisplay:
-    """What both displays have in common."""
+    """Common parts of both displays."""
 
     def __init__(
         self, console: Console, run_id: str, max_steps: int, lesson_count: int, start_step: int

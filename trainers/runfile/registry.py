@@ -42,7 +42,7 @@ CURRICULUM_METHODS = (
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a component came from: the plugin, and the distribution that brought it."""
+    """Origin of a component: the plugin, and the distribution that brought it."""
 
     plugin: str
     """The module of a built-in plugin, or the name of the entry point."""
@@ -86,7 +86,7 @@ class Registry:
     entries: Mapping[str, Entry]
 
     def get(self, name: str) -> Entry:
-        """Return the component called `name`.
+        """The component called `name`.
 
         Raises:
             UnknownComponentError: with the nearest names.

@@ -80,7 +80,7 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class PolicyComponents:
-    """What a policy's networks are made of."""
+    """Components of a policy's networks."""
 
     encoders: dict[str, Component]
     """By the name of the observation."""
@@ -88,7 +88,7 @@ class PolicyComponents:
 
 
 class Target(BaseModel, frozen=True, extra="forbid"):
-    """What a run may stop at."""
+    """Goal at which a run may stop."""
 
     metric: str = Field(
         min_length=1, description="A figure of the evaluation, such as success or reward."
@@ -166,7 +166,7 @@ def load_policy(path: Path, registries: Registries) -> PolicyComponents:
 
 
 def resolved(run: RunSettings) -> dict[str, Any]:
-    """Return a run as plain data with every default written out.
+    """A run as plain data with every default written out.
 
     Dumped as YAML and loaded again, it gives an equal run.
     """
@@ -246,7 +246,7 @@ class _Sections:
         return {name: encoder for name, encoder in found.items() if encoder}
 
     def mapping(self, key: str) -> dict[str, Any]:
-        """Return a section; empty where it is absent or, as was noted at the top, no mapping."""
+        """A section; empty where it is absent or, as was noted at the top, no mapping."""
         section = self.document.data.get(key)
         return section if isinstance(section, dict) else {}
 

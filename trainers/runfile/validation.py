@@ -31,7 +31,7 @@ PLAIN_WORDS = {
 """pydantic's error types -> what to say instead of its words, which are Python's and JSON's."""
 
 PYDANTIC_EXTRAS = r"^\w+ (?=should )| after validation, not \d+$"
-"""What to leave out of pydantic's other messages: "Input should be" and the like."""
+"""Parts to leave out of pydantic's other messages: "Input should be" and the like."""
 
 
 class InvalidError(Exception):
@@ -127,7 +127,7 @@ def missing(owners: list[type[BaseModel]], step: str | int) -> str:
 
 
 def models_at(annotation: Any, path: KeyPath, data: Any) -> list[type[BaseModel]]:
-    """Return the models that describe `path`, by the type annotations from `annotation` on.
+    """The models that describe `path`, by the type annotations from `annotation` on.
 
     Where several could, those stay whose `Literal` fields have the values written in the data.
     """

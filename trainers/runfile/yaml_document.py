@@ -254,7 +254,7 @@ class _Reader:
         return None
 
     def pairs(self, node: yaml.MappingNode, path: KeyPath) -> list[tuple[yaml.Node, yaml.Node]]:
-        """Return keys and values with merge keys (`<<`) resolved, having checked the keys."""
+        """Keys, which are checked, and values, with merge keys (`<<`) resolved."""
         # An anchored mapping is met again at every alias; once resolved, merged keys that it
         # overrides look like duplicates.
         if id(node) not in self.flat:

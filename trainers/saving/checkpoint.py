@@ -51,7 +51,7 @@ class CheckpointError(UserError):
 
 @dataclass(frozen=True)
 class Loaded:
-    """What a checkpoint held.
+    """Content of a checkpoint.
 
     Attributes:
         step: environment steps taken when it was saved.
@@ -73,7 +73,7 @@ class Loaded:
 
 @dataclass(frozen=True)
 class CheckpointInfo:
-    """What is known of a checkpoint without reading it.
+    """Facts of a checkpoint that are known without reading it.
 
     Attributes:
         step: environment steps taken when it was saved.

@@ -1,4 +1,4 @@
-"""How policies that grasp are judged: by their first action, by picks, and by pictures."""
+"""Evaluation of policies that grasp: by their first action, by picks, and by pictures."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ LIFT_SLACK_M = 0.01
 
 
 class Outcome(StrEnum):
-    """How a pick ended."""
+    """Outcome of a pick."""
 
     SUCCESS = "success"
     COLLISION = "collision"
@@ -66,7 +66,7 @@ class Outcome(StrEnum):
 
 
 class Touch(Enum):
-    """What the robot touches, the worst of it."""
+    """Contact of the robot, the worst of those it has."""
 
     NOTHING = auto()
     CUP_ON_TARGET = auto()
@@ -193,7 +193,7 @@ class Attempt:
         self._id, self._settings, self._scene, self._watch = client, settings, scene, watch
         self._arm, self._kinematics = arm, arm.robot
         self._inverse = InverseKinematics(arm.robot)
-        # Nothing that a solver remembers of an earlier pick can change this one.
+        # No state that a solver keeps of an earlier pick can change this one.
         pybullet.resetSimulation(physicsClientId=client)
         pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)
         pybullet.setTimeStep(STEP_S, physicsClientId=client)
@@ -266,14 +266,14 @@ class Attempt:
         return self.target_pose()[0][2] - self._start_height_m >= settings.lift_m - LIFT_SLACK_M
 
     def target_pose(self) -> Transform:
-        """Where the target is: its centre of mass, and how it is turned."""
+        """Pose of the target: its centre of mass, and how it is turned."""
         pose: Transform = pybullet.getBasePositionAndOrientation(
             self._target, physicsClientId=self._id
         )
         return pose
 
     def picture(self, views: CameraPoses) -> Images:
-        """What an RGB camera, the first of the views, sees now: (H, W, 3)."""
+        """Picture (H, W, 3) that an RGB camera, the first of the views, takes now."""
         view, projection = view_matrices(views)[0], projection_matrices(views)[0]
         return take_picture(self._id, self._scene, views.camera, view, projection)[0]
 

@@ -46,7 +46,7 @@ DPI = 110
 
 
 def contact_sheet(shots: Sequence[Sample], goal_m: Floats) -> bytes:
-    """What the camera saw, with the cup drawn at the goal and where the policy sent it.
+    """Camera pictures, with the cup drawn at the goal and where the policy sent it.
 
     Args:
         shots: the episodes, one or more.
@@ -100,7 +100,7 @@ def error_histograms(judged: PoseErrors, goal: Goal) -> bytes:
 
 
 def workspace(judged: PoseErrors) -> bytes:
-    """Where on the support, and at which yaw, the errors are."""
+    """Errors over the positions on the support, and over the yaws."""
     figure = Figure(figsize=(11.0, 4.4), layout="constrained")
     above, turned = figure.subplots(1, 2, width_ratios=(1.3, 1.0))
     distance_mm = judged.distance_m * 1000.0

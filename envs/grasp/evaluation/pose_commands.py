@@ -1,4 +1,4 @@
-"""Where actions would lead in running episodes: what is judged outside of them, and drawn."""
+"""Poses that actions command in running episodes: what is judged outside of them, and drawn."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """How far n commands are off, and where.
+    """Errors of n commands, and where they were made.
 
     Attributes:
         target_m: (n, 3) grasp points, world frame.
@@ -52,7 +52,7 @@ class Sample:
 
     @property
     def caption(self) -> str:
-        """How far the aim is off, and what came of it."""
+        """Error of the aim, and what came of it."""
         judged = self.judged
         error = f"{judged.distance_m[0] * 1000:.1f} mm, {abs(judged.yaw_error_deg[0]):.1f} deg"
         return f"{error}   {outcome_label(judged.outcome[0])}".rstrip()

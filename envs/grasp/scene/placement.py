@@ -1,4 +1,4 @@
-"""Where the blocks stand: drawn at random until every rule is kept, one scene after the other."""
+"""Placement of the blocks: drawn at random until every rule is kept, one scene after the other."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_TRIES = 20_000
 
 
 class Rules(NamedTuple):
-    """What a scene has to obey, as plain numbers and arrays; ranges are (low, high)."""
+    """Rules that a scene obeys, as plain numbers and arrays; ranges are (low, high)."""
 
     shapes: NDArray[np.int64]
     x_m: Floats

@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CameraPoses(Batch):
-    """Where n cameras of one kind stand.
+    """Poses of n cameras of one kind.
 
     Attributes:
         camera: what they have in common.

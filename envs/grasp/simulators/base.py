@@ -1,4 +1,4 @@
-"""What the task asks of a simulator: one interface, several engines."""
+"""The contract of a simulator: one interface, several engines."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class SimulatorError(EnvironmentFailure):
 
 @dataclass(frozen=True)
 class Contacts:
-    """What was touched along n motions.
+    """Contacts along n motions.
 
     Attributes:
         touched: (n,) the cup touched the target block.

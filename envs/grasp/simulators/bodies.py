@@ -1,4 +1,4 @@
-"""What PyBullet's worlds are made of: client, robot, support, bodies of boxes, and pictures."""
+"""Parts of PyBullet's worlds: client, robot, support, bodies of boxes, and pictures."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ class PyBulletSimulator:
 
 @dataclass
 class _Found:
-    """What was touched so far."""
+    """Contacts found so far."""
 
     touched: bool = False
     collided: bool = False
@@ -124,7 +124,7 @@ class _Found:
 
 @dataclass
 class _World:
-    """What one client remembers of one of its worlds."""
+    """State of one of a client's worlds."""
 
     scene: Scenes
     joints_rad: Floats

@@ -1,4 +1,4 @@
-"""What this package adds to ventosa: found through the entry point in pyproject.toml."""
+"""The hooks of this package, which ventosa finds through the entry point in pyproject.toml."""
 
 from trainers.hookspecs import hookimpl
 from ventosa_sac.sac import SAC

@@ -81,7 +81,7 @@ class SAC(OffPolicyAlgorithm):
         return self._sample(observations, features.actor)[0]
 
     def _improve_critic(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
-        """Descends the mean of (Q_i(s, a) - y)^2, summed over both critics (eq. 5)."""
+        """Optimizer step on the mean of (Q_i(s, a) - y)^2, summed over both critics (eq. 5)."""
         targets = self._targets(indices)
         observations = self._augment(self._buffer.observations(indices, self.policy.critic_sees))
         values = self.policy.value(observations, self._buffer.actions(indices), target=False)
@@ -100,14 +100,14 @@ class SAC(OffPolicyAlgorithm):
         return returns + discounts * (values - self.policy.log_alpha.exp() * log_probs)
 
     def _improve_actor(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
-        """Descends the mean of alpha log pi(a|s) - min_i Q_i(s, a) (eq. 9), then learns alpha."""
+        """Optimizer steps: mean of alpha log pi(a|s) - min_i Q_i(s, a) (eq. 9), then alpha."""
         alpha = self.policy.log_alpha.detach().exp()
         observations = self._augment(self._buffer.observations(indices, self._seen))
         actions, log_probs = self._sample(observations)
         values = self.policy.value(observations, actions, target=False).amin(dim=0)
         loss = (alpha * log_probs - values).mean()
         self._optimizer_step(ACTOR, loss)
-        # J(alpha) = E[-alpha (log pi(a|s) + H)] (eq. 18), descended in log alpha as is usual
+        # J(alpha) = E[-alpha (log pi(a|s) + H)] (eq. 18), minimized in log alpha as is usual
         entropy = -log_probs.detach().mean()
         self._optimizer_step(TEMPERATURE, self.policy.log_alpha * (entropy - self._target_entropy))
         return {

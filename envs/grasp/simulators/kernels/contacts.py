@@ -1,4 +1,4 @@
-"""What the robot's boxes and cylinders touch of the boxes of its world along a motion.
+"""Contacts of the robot's boxes and cylinders with the boxes of its world along a motion.
 
 Conservative advancement: a shape that is a distance away from everything, and none of whose points
 moves faster than a bound, touches nothing for the time that is their quotient, and is looked at
@@ -149,7 +149,7 @@ def _contacts(
 
 @kernel(counts=False)
 def _legs_that_count(paths: Floats, row: int) -> int:
-    """How many legs there are to the end of the last one that moves."""
+    """Number of legs to the end of the last one that moves."""
     for knot in range(paths.shape[1] - 1, 0, -1):
         for joint in range(paths.shape[2]):
             if paths[row, knot, joint] != paths[row, knot - 1, joint]:

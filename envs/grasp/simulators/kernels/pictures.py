@@ -49,7 +49,7 @@ class ViewArrays(NamedTuple):
 
 
 class Eye(NamedTuple):
-    """Where one camera stands, and its axes in the world."""
+    """Position of one camera, and its axes in the world."""
 
     position: Vector
     right: Vector

@@ -74,7 +74,7 @@ class Canvas(NamedTuple):
 
 
 class Slab(NamedTuple):
-    """Where a solid ends along one of its axes.
+    """Ends of a solid along one of its axes.
 
     The point at depth z on the ray of pixel (column, row) lies at z * (right * column + down * row
     + start) along the axis, and the solid from `middle - half` to `middle + half`.

@@ -1,4 +1,4 @@
-"""What the kernels know of the robot and of the worlds, and where the robot's links are."""
+"""The robot and the worlds as the kernels know them, and the poses of the robot's links."""
 
 from __future__ import annotations
 
