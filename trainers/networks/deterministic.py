@@ -13,11 +13,9 @@ from trainers.networks.actions import ActionScaling
 from trainers.networks.actor_critic import ACTOR_GAIN, CRITIC_GAIN, ActorCriticSettings, observed
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.frame_features import FrameFeatures
-from trainers.networks.network import Network, NetworkSettings, head, hidden_layers, precision
+from trainers.networks.network import Dense, Network
 from trainers.networks.observations import Observations
 from trainers.networks.off_policy_network import OffPolicyNetwork, TargetAverage
-
-ENCODERS_ALONE = {"num_layers": 0}
 
 
 def _refuse_memory(value: Any) -> None:
@@ -65,16 +63,15 @@ class DeterministicActorCritic(nn.Module):
     def __init__(self, factory: NetworkFactory, settings: DeterministicSettings):
         super().__init__()
         self.actor_sees, self.critic_sees = observed(factory, settings)
-        encoders_alone = settings.model_copy(update=ENCODERS_ALONE)
-        self.critic_encoder = factory.network(encoders_alone, self.critic_sees)
+        self.critic_encoder = factory.encoders(settings, self.critic_sees)
         self.actor_encoder: Network | None = None
         if settings.critic == "separate":
-            self.actor_encoder = factory.network(encoders_alone, self.actor_sees)
+            self.actor_encoder = factory.encoders(settings, self.actor_sees)
         size = ActionScaling(factory.action_space).size
         actor_inputs = self._acting_encoder.features_dim
-        self.actor = _Dense(actor_inputs, size, ACTOR_GAIN, settings)
+        self.actor = Dense(actor_inputs, size, ACTOR_GAIN, settings)
         critic_inputs = self.critic_encoder.features_dim + size
-        self.critic = _Dense(critic_inputs, 1, CRITIC_GAIN, settings)
+        self.critic = Dense(critic_inputs, 1, CRITIC_GAIN, settings)
 
     def act(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
         """mu(s): actions (B, A) in [-1, 1]; `encode_frames` may have looked at the frames."""
@@ -166,21 +163,3 @@ class DeterministicPolicy(OffPolicyNetwork):
         if self.online.actor_encoder is not None:
             self.online.actor_encoder.update_statistics(vectors)
         self._average.copy_buffers()
-
-
-class _Dense(nn.Sequential):
-    """Hidden layers in the precision of the settings, and a last one in float32."""
-
-    def __init__(self, inputs: int, outputs: int, gain: float, settings: NetworkSettings):
-        hidden, width = hidden_layers(inputs, settings)
-        super().__init__(*hidden, head(width, outputs, gain))
-        self._settings = settings
-
-    def forward(self, features: Tensor) -> Tensor:
-        """(B, inputs) -> (B, outputs) float32."""
-        *hidden, last = self
-        with precision(self._settings, features.device):
-            for layer in hidden:
-                features = layer(features)
-        outputs: Tensor = last(features.float())
-        return outputs

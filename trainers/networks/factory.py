@@ -71,3 +71,15 @@ class NetworkFactory:
             name: self._build_encoder(name, space, settings) for name, space in spaces.items()
         }
         return Network(encoders, spaces, settings, memory)
+
+    def encoders(self, settings: NetworkSettings, names: Sequence[str]) -> Network:
+        """A new network without hidden layers, whose features others go on with.
+
+        Args:
+            settings: what follows.
+            names: of the observations.
+
+        Raises:
+            UserError: an encoder does not fit its observation.
+        """
+        return self.network(settings.model_copy(update={"num_layers": 0}), names)

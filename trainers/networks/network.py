@@ -175,3 +175,28 @@ def hidden_layers(inputs: int, settings: NetworkSettings) -> tuple[nn.Sequential
 def head(inputs: int, outputs: int, gain: float) -> nn.Linear:
     """A last layer with small, orthogonal weights."""
     return _orthogonal(nn.Linear(inputs, outputs), gain)
+
+
+class Dense(nn.Sequential):
+    """Hidden layers in the precision of the settings, and a last one in float32.
+
+    Args:
+        inputs: length of the features.
+        outputs: length of what comes out.
+        gain: of the last layer's weights; see `head`.
+        settings: the hidden layers.
+    """
+
+    def __init__(self, inputs: int, outputs: int, gain: float, settings: NetworkSettings):
+        hidden, width = hidden_layers(inputs, settings)
+        super().__init__(*hidden, head(width, outputs, gain))
+        self._settings = settings
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, inputs) -> (B, outputs) float32."""
+        *hidden, last = self
+        with precision(self._settings, features.device):
+            for layer in hidden:
+                features = layer(features)
+        outputs: Tensor = last(features.float())
+        return outputs

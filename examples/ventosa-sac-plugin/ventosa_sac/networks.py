@@ -13,12 +13,11 @@ from trainers.networks.actions import ActionScaling
 from trainers.networks.actor_critic import ActorCriticSettings, observed
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.frame_features import FrameFeatures
-from trainers.networks.network import head, hidden_layers
+from trainers.networks.network import Dense, head
 from trainers.networks.observations import Observations
 from trainers.networks.off_policy_network import OffPolicyNetwork, TargetAverage
 
 MIN_LOG_STD, MAX_LOG_STD = -20.0, 2.0
-ENCODERS_ALONE = {"num_layers": 0}
 Sees = tuple[str, ...]
 
 
@@ -56,10 +55,9 @@ class Critic(nn.Module):
 
     def __init__(self, factory: NetworkFactory, sees: Sees, settings: ActorCriticSettings):
         super().__init__()
-        self.encoder = factory.network(settings.model_copy(update=ENCODERS_ALONE), sees)
+        self.encoder = factory.encoders(settings, sees)
         inputs = self.encoder.features_dim + ActionScaling(factory.action_space).size
-        hidden, width = hidden_layers(inputs, settings)
-        self.layers = nn.Sequential(*hidden, head(width, 1, gain=1.0))
+        self.layers = Dense(inputs, 1, gain=1.0, settings=settings)
 
     def forward(self, observations: Observations, actions: Tensor) -> Tensor:
         """Values (B,) of actions (B, A) in [-1, 1]."""
