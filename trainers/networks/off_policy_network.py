@@ -44,7 +44,7 @@ class TargetAverage:
     def __init__(self, target: nn.Module, online: nn.Module, tau: float):
         self._average = get_ema_multi_avg_fn(1.0 - tau)
         self._pairs = list(target.parameters()), list(online.parameters())
-        self._buffers = list(target.buffers()), list(online.buffers())
+        self._target, self._online = target, online
 
     def update(self) -> None:
         """Moves the target's parameters."""
@@ -52,5 +52,6 @@ class TargetAverage:
 
     def copy_buffers(self) -> None:
         """Makes the target's buffers, such as statistics of observations, those of the other."""
-        for theirs, ours in zip(*self._buffers, strict=True):
+        # Looked up anew: a module that moves to another device keeps its parameters alone.
+        for theirs, ours in zip(self._target.buffers(), self._online.buffers(), strict=True):
             theirs.copy_(ours)

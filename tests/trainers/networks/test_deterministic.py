@@ -11,7 +11,11 @@ import torch
 from gymnasium.spaces import Box
 from torch import nn
 
-from trainers.networks.deterministic import DeterministicActorCritic, DeterministicSettings
+from trainers.networks.deterministic import (
+    DeterministicActorCritic,
+    DeterministicPolicy,
+    DeterministicSettings,
+)
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import Observations
 
@@ -58,3 +62,14 @@ def test_lower_precision_moves_values_by_little_and_keeps_the_weights_names(
     values, others = (n.value(observations, actions) for n in (exact, lowered))
     error = (values - others).abs().max()
     assert 0 < error < 0.02 * values.abs().max()  # eight bits of a mantissa, three layers
+
+
+def test_targets_see_the_same_statistics_wherever_the_policy_went(
+    make_factory: Callable[..., NetworkFactory],
+) -> None:
+    settings = DeterministicSettings(hidden_units=4, normalize=True)
+    policy = DeterministicPolicy(make_factory({"joints": JOINTS}), settings, tau=0.1)
+    policy.float()  # buffers of float64 are replaced, as all are on the way to another device
+    policy.update_statistics({"joints": torch.tensor([[3.0, 5.0, 7.0], [5.0, 5.0, 9.0]])})
+    means = [values.tolist() for name, values in policy.named_buffers() if name.endswith("mean")]
+    assert means == [[4.0, 5.0, 8.0]] * 4  # actor and critic, online and target
