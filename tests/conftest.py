@@ -419,7 +419,7 @@ def sections(environment: Any, trainer: Mapping[str, Any], rest: Mapping[str, An
         "hyperparameters": {"batch_size": 8, "buffer_size": 16, "num_epoch": 1},
         "network_settings": {"hidden_units": 8, "num_layers": 1},
     }
-    if name == "ddpg":
+    if name in ("ddpg", "sac"):
         memory = {"batch_size": 8, "buffer_size": 64, "buffer_init_steps": 16}
         small |= {"time_horizon": 4, "hyperparameters": memory}
     merged = {**small, **trainer}
