@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -43,15 +39,3 @@ def test_an_environment_that_declares_nothing_says_what_it_lacks(what: str) -> N
         getattr(Evaluator(), what)()
     assert Evaluator.figures == ()
     assert not Evaluator.judges_first_action
-
-
-def test_the_documented_darts_are_what_is_said_of_them() -> None:
-    documented = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text()
-    (block,) = re.findall(r"```python\n(from envs\.environment .*?)```", documented, re.DOTALL)
-    namespace: dict[str, Any] = {}
-    exec(block, namespace)
-    inside, distance = namespace["DartsEvaluator"].figures
-    assert (inside.name, distance.name) == ("inside_rate", "distance_m")
-    assert distance.shown(0.0123) == "1.23 cm"
-    (wind,) = namespace["Darts"].evaluation_options
-    assert (wind.flag, wind.key) == ("--wind", "environment.wind_m_s")
