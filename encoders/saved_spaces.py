@@ -59,9 +59,10 @@ def space_from_plain(plain: Plain) -> gymnasium.Space[Any]:
     fields = {key: value for key, value in plain.items() if key != "type"}
     match plain["type"]:
         case "dict":
-            # In their own order, which gymnasium would keep for an OrderedDict alone.
-            entries = {name: space_from_plain(part) for name, part in fields["entries"].items()}
-            return gymnasium.spaces.Dict(entries)
+            # As pairs: gymnasium would sort a dictionary, and networks concatenate in this order.
+            return gymnasium.spaces.Dict(
+                [(name, space_from_plain(part)) for name, part in fields["entries"].items()]
+            )
         case "discrete":
             return Discrete(fields["n"], start=fields["start"])
         case "depth_image":
@@ -82,6 +83,8 @@ def _bound_to_plain(bound: NDArray[Any]) -> Any:
 
 
 def _bound_from_plain(plain: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    # Integers stay integers: 2^64 - 1 is no float64.
+    kind = int if np.issubdtype(dtype, np.integer) else float
     if isinstance(plain, list):
-        return np.array([float(value) for value in plain]).astype(dtype).reshape(shape)
-    return np.full(shape, float(plain)).astype(dtype)
+        return np.array([kind(value) for value in plain], dtype).reshape(shape)
+    return np.full(shape, kind(plain), dtype)

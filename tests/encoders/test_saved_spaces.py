@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from collections import OrderedDict
 from typing import Any
 
 import gymnasium
@@ -19,12 +20,15 @@ from encoders.spaces import DepthImage, RgbImage
         Box(np.array([-1.0, -np.inf]), np.array([0.1, np.inf]), dtype=np.float32),
         Box(np.array([-1.0, 0.3]), np.array([0.1, 1e300]), dtype=np.float64),
         Box(0, 255, (84, 84, 4), np.uint8),
+        Box(0, 2**64 - 1, (2,), np.uint64),
+        Box(np.array([-(2**63), 0]), np.array([2**63 - 1, 2**62 + 1]), dtype=np.int64),
         Discrete(5),
         Discrete(3, start=-1),
         DepthImage(48, 64, (0.4, 2.0), "uint8", 51.2),
         DepthImage(48, 64),
         RgbImage(2, 3),
         Dict({"b": Box(0.0, 1.0, (2,), np.float32), "a": RgbImage(1, 1)}),
+        Dict(OrderedDict(b=Box(0.0, 1.0, (2,), np.float32), a=Box(0.0, 1.0, (2,), np.float32))),
     ],
 )
 def test_a_space_comes_back_through_json(space: gymnasium.Space[Any]) -> None:

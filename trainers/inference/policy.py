@@ -57,8 +57,9 @@ class Policy:
         seed: int = 0,
     ):
         self.network, self.action_space = network, action_space
+        # As pairs, whose order gymnasium keeps; it would sort a dictionary.
         self.observation_space = gymnasium.spaces.Dict(
-            {name: observation_space[name] for name in network.sees}
+            [(name, observation_space[name]) for name in network.sees]
         )
         self._ignored = observation_space.spaces.keys() - set(network.sees)
         self._device = next(network.parameters()).device

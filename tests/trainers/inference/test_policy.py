@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box, Dict
 
 from trainers.common.errors import UserError
 from trainers.inference.metadata import FILE
@@ -122,6 +123,15 @@ def test_what_a_critic_alone_sees_may_be_left_out(saved: Save) -> None:
     with_it, _ = policy.predict(seen)
     without, _ = policy.predict({"goal": seen["goal"]})
     np.testing.assert_array_equal(with_it, without)
+
+
+def test_observations_are_in_the_order_in_which_the_network_sees_them(saved: Save) -> None:
+    _, session = saved()
+    network = session.algorithm.policy
+    network.sees = ("second", "first")
+    spaces = {name: Box(0.0, 1.0, (2,)) for name in ("first", "second")}
+    policy = Policy(network, Dict(spaces), session.metadata.action_space)
+    assert list(policy.observation_space) == ["second", "first"]
 
 
 def test_drawn_actions_follow_the_seed(saved: Save) -> None:
