@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    Field,
+    FiniteFloat,
+    field_validator,
+    model_validator,
+)
 
 from envs.grasp.scene.blocks import MIN_BAR_M
 
@@ -16,10 +23,30 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
-Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
-Point = tuple[float, float, float]
+Range = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_ordered)]
+Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 MIN_CONTACT_RESOLUTION_M = 1e-6
+# Well under the thinnest bar of a block, so that nothing is passed through.
+MAX_CONTACT_RESOLUTION_M = 0.02
+# About as far as the arm can go straight ahead at all.
+MAX_STANDOFF_M = 1.0
+
+
+def check_resolution(resolution_m: float) -> float:
+    """The resolution of a look for contacts, in metres, if it is one.
+
+    Raises:
+        ValueError: it is so fine that a motion has no end of looks, or so coarse that the robot
+            could pass through a block between two of them.
+    """
+    if not MIN_CONTACT_RESOLUTION_M <= resolution_m <= MAX_CONTACT_RESOLUTION_M:
+        raise ValueError(
+            f"contacts can't be looked for every {resolution_m} m: a motion would have no end of "
+            "looks, or blocks between two of them; give "
+            f"{MIN_CONTACT_RESOLUTION_M:g} to {MAX_CONTACT_RESOLUTION_M:g} m, such as 0.005"
+        )
+    return resolution_m
 
 
 class Camera(BaseModel, frozen=True, extra="forbid"):
@@ -233,6 +260,7 @@ class GraspSettings(BaseModel, frozen=True, extra="forbid"):
     standoff_m: float = Field(
         0.10,
         gt=0.0,
+        le=MAX_STANDOFF_M,
         description="How far behind a pose the stand-off is, or as far as the joint limits allow.",
     )
     contact_resolution_m: float = Field(
@@ -252,13 +280,8 @@ class GraspSettings(BaseModel, frozen=True, extra="forbid"):
 
     @field_validator("contact_resolution_m")
     @classmethod
-    def _resolution_is_finite(cls, value: float) -> float:
-        if not value >= MIN_CONTACT_RESOLUTION_M:
-            raise ValueError(
-                f"{value} m is too fine: a motion would have no end of looks; give "
-                f"{MIN_CONTACT_RESOLUTION_M:g} m or more, such as 0.005"
-            )
-        return value
+    def _resolution_is_possible(cls, value: float) -> float:
+        return check_resolution(value)
 
     @model_validator(mode="after")
     def _names_are_free(self) -> GraspSettings:

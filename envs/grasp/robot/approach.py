@@ -10,6 +10,7 @@ import numpy as np
 from envs.grasp.robot.kinematics import ArmLengths, arm_lengths, solve_frame, within
 from envs.grasp.robot.paths import Floats, Path
 from envs.grasp.robot.urdf import Robot
+from envs.grasp.settings import MAX_STANDOFF_M
 
 # Over the default workspace, parabolas of such a length leave the straight line by 0.3 mm and 0.07
 # deg at most, and by 0.03 mm on average.
@@ -29,10 +30,16 @@ class Approach:
         knots: of every way, 2 k + 1 for k legs.
 
     Raises:
-        ValueError: the robot is built in another way.
+        ValueError: the robot is built in another way, or the stand-off is not between 0 and
+            `MAX_STANDOFF_M`.
     """
 
     def __init__(self, robot: Robot, standoff_m: float):
+        if not 0.0 <= standoff_m <= MAX_STANDOFF_M:
+            raise ValueError(
+                f"environment.standoff_m {standoff_m} m: no arm comes from so far; give over 0 and "
+                f"up to {MAX_STANDOFF_M:g} m, such as the default 0.1"
+            )
         self._arm, self._last_link = arm_lengths(robot), np.linalg.inv(robot.tooltip)
         self._lower_rad, self._upper_rad = robot.lower_rad, robot.upper_rad
         self._standoff_m = standoff_m

@@ -18,7 +18,7 @@ from envs.grasp.robot.urdf import Box, Robot
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses, focal_length_px
 from envs.grasp.sensors.depth import Sensor, sensor_of
-from envs.grasp.settings import Support
+from envs.grasp.settings import Support, check_resolution
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
 from envs.grasp.simulators.colors import BLOCK_RGBA, SUPPORT_RGBA
 from envs.grasp.simulators.kernels.contacts import touch_along
@@ -88,12 +88,11 @@ class FastSimulator:
 
         Raises:
             ValueError: a joint angle is not finite, the number of knots is even, the resolution is
-                not positive, or a world holds no scene.
+                none, or a world holds no scene.
         """
         indices = self._checked(indices, loaded=True)
         check_knots(path_rad)
-        if not resolution_m > 0.0:
-            raise ValueError(f"a resolution of {resolution_m} m: it must be over 0")
+        check_resolution(resolution_m)
         shape = (len(indices), path_rad.shape[1], len(self._robot.axes))
         _check(path_rad, shape, "path_rad")
         touched, collided = np.zeros(len(indices), bool), np.zeros(len(indices), bool)

@@ -17,7 +17,7 @@ from envs.grasp.robot.urdf import Robot
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses, focal_length_px
 from envs.grasp.sensors.depth import sense_depth
-from envs.grasp.settings import Camera, Support
+from envs.grasp.settings import Camera, Support, check_resolution
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
 from envs.grasp.simulators.bodies import (
     UPRIGHT,
@@ -68,6 +68,7 @@ class PyBulletSimulator:
 
     def move(self, indices: Indices, path_rad: Path, resolution_m: float) -> Contacts:
         """See `Simulator.move`."""
+        check_resolution(resolution_m)
         flags = np.zeros((len(indices), 2), bool)
         for row, index in enumerate(indices):
             client, slot = self._place(index)

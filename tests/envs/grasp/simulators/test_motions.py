@@ -57,6 +57,18 @@ def test_a_wall_thinner_than_any_step_is_hit(
 
 
 @BOTH
+@pytest.mark.parametrize("resolution_m", [0.0, -0.005, 0.021, float("inf"), float("nan")])
+def test_a_resolution_that_is_none_is_refused(
+    make: type, open_simulators: list[Simulator], box_scene: SceneBuilder, resolution_m: float
+) -> None:
+    simulator = make(1, ROBOT, Support())
+    open_simulators.append(simulator)
+    simulator.load(FIRST, box_scene([TARGET]), home(1))
+    with pytest.raises(ValueError, match=r"give 1e-06 to 0\.02 m"):
+        simulator.move(FIRST, pose(1.1, 0.0, 0.8), resolution_m)
+
+
+@BOTH
 @pytest.mark.parametrize(("gap_m", "touched"), [(0.0005, False), (-0.0005, True)])
 def test_half_a_millimetre_tells_at_the_end_of_a_straight_way(
     make: type,
