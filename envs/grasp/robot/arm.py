@@ -6,6 +6,7 @@ Everything is in the world frame, with arrays of leading length N, unless said o
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from envs.grasp.batch import Batch
 from envs.grasp.robot.approach import Approach
-from envs.grasp.robot.kinematics import tooltip_pose
+from envs.grasp.robot.kinematics import arm_lengths, tooltip_pose
 from envs.grasp.robot.paths import Path, duration_s, joined, leg_poses, legs, straight_leg
 from envs.grasp.robot.urdf import Robot
 from envs.grasp.scene.sampler import heading
@@ -21,7 +22,7 @@ from envs.grasp.settings import GraspSettings, Workspace
 
 Floats = NDArray[np.float64]
 
-# Poses along each of the workspace's four ranges that are looked at when an arm is made.
+# Poses, evenly along each of the workspace's four ranges, that are looked at when an arm is made.
 PROBES = 7
 # Parts of a leg at which a parabola is furthest from a straight line, and how far it may be.
 BETWEEN = (0.2, 0.8)
@@ -112,8 +113,16 @@ class Arm:
         Returns:
             The tools afterwards, the path there (N, 2 k + 1, 6) from where `start` is, and its
             duration (N,) in seconds.
+
+        Raises:
+            ValueError: a pose is out of reach.
         """
-        approach, _ = self._approach(tooltip_m, yaw_rad)
+        approach, length_m = self._approach(tooltip_m, yaw_rad)
+        if length_m.min() < 0.0:
+            row = int(np.argmin(length_m))
+            raise ValueError(
+                f"{_in_words(np.append(tooltip_m[row], yaw_rad[row]))} is out of the arm's reach"
+            )
         path = joined(
             start.approach_rad[:, ::-1],
             straight_leg(start.approach_rad[:, 0], approach[:, 0]),
@@ -124,29 +133,50 @@ class Arm:
 
     def _check_reach(self, standoff_m: float) -> None:
         """Raises ValueError where the workspace is not for this arm."""
-        parts = itertools.product(np.linspace(0.0, 1.0, PROBES), repeat=4)
-        poses = self._low + np.array(list(parts)) * (self._high - self._low)
+        poses = self._probes()
         approach, length_m = self._approach(poses[:, :3], poses[:, 3])
         tooltip_m = tooltip_pose(self.robot, approach[:, -1])[:, :3, 3]
         off_m = np.where(length_m < 0.0, np.linalg.norm(tooltip_m - poses[:, :3], axis=1), -1.0)
         worst = int(np.argmax(off_m))
         if off_m[worst] >= 0.0:
-            x, y, z, yaw = poses[worst]
             raise ValueError(
-                f"environment.workspace: {np.mean(off_m >= 0.0):.0%} of its poses are out of "
-                f"reach, the worst by {1000.0 * off_m[worst]:.0f} mm (x {x:.3f} m, y {y:.3f} m, "
-                f"z {z:.3f} m, yaw {np.degrees(yaw):.1f} deg): narrow its ranges; the default ones "
-                "are in reach"
+                f"environment.workspace: {np.mean(off_m >= 0.0):.2%} of its poses are out of "
+                f"reach, the worst by {1000.0 * off_m[worst]:.1f} mm ({_in_words(poses[worst])}): "
+                "narrow its ranges; the default ones are in reach"
             )
+        if (longest_m := float(length_m.max())) < standoff_m:
+            raise ValueError(
+                f"environment.standoff_m {standoff_m} m is longer than the way to any pose of the "
+                f"workspace: lower it to {math.floor(1000.0 * longest_m) / 1000.0} m at most"
+            )
+        aside_m = self._aside_m(poses, approach)
+        if aside_m > MAX_ASIDE_M:
+            raise ValueError(
+                f"environment.standoff_m {standoff_m} m leads out of where the arm moves straight: "
+                f"a way to a pose of the workspace is left by {1000.0 * aside_m:.1f} mm; lower it, "
+                "or narrow the workspace"
+            )
+
+    def _probes(self) -> Floats:
+        """Poses (n, 4), tooltip and yaw, all over the workspace, and where reach is extreme.
+
+        The wrist is nearest to the shoulder, and furthest from it, straight ahead and level with it
+        or at the ends of the ranges.
+        """
+        level = np.clip([np.inf, 0.0, arm_lengths(self.robot).height, 0.0], self._low, self._high)
+        even = np.linspace(self._low, self._high, PROBES)
+        return np.array(list(itertools.product(*np.vstack([even, level]).T)))
+
+    def _aside_m(self, poses: Floats, approach: Path) -> float:
+        """How far the tool leaves the straight ways to poses (n, 4) on paths (n, 2 k + 1, 6)."""
         frames = tooltip_pose(self.robot, leg_poses(legs(approach), np.array(BETWEEN)))
         way_m = frames[..., :3, 3] - poses[:, None, None, :3]
         axis = heading(poses[:, 3])[:, None, None]
         along_m = np.sum(way_m * axis, axis=-1, keepdims=True)
-        aside_m = np.linalg.norm(way_m - along_m * axis, axis=-1).max()
-        if aside_m > MAX_ASIDE_M or length_m.max() < standoff_m:
-            raise ValueError(
-                f"environment.standoff_m {standoff_m} m leads out of where the arm moves straight: "
-                f"{length_m.max():.3f} m is the longest way to a pose of the workspace, and one is "
-                f"left by {1000.0 * aside_m:.1f} mm; lower it to the default 0.1, or narrow the "
-                "workspace"
-            )
+        return float(np.linalg.norm(way_m - along_m * axis, axis=-1).max())
+
+
+def _in_words(pose: Floats) -> str:
+    """A pose (4,), tooltip and yaw."""
+    x, y, z, yaw = pose
+    return f"x {x:.3f} m, y {y:.3f} m, z {z:.3f} m, yaw {np.degrees(yaw):.1f} deg"

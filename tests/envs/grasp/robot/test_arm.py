@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 
 import numpy as np
 import pytest
@@ -156,7 +157,7 @@ def test_home() -> None:
 def test_a_workspace_out_of_reach_is_refused_with_its_worst_pose() -> None:
     workspace = Workspace(x_m=(0.60, 1.35))
     with pytest.raises(
-        ValueError, match=r"workspace: \d+% .*the worst by (\d+) mm \(x 0\.600 m"
+        ValueError, match=r"workspace: [\d.]+% .*the worst by \d+\.\d mm \(x 0\.600 m"
     ) as e:
         Arm(ROBOT, workspace, 0.1)
     assert "narrow its ranges" in str(e.value)
@@ -167,9 +168,44 @@ def test_a_workspace_out_of_reach_is_refused_with_its_worst_pose() -> None:
     assert off_mm > 100
 
 
-@pytest.mark.parametrize("standoff_m", [0.3, 1.0, 5.0])
-def test_a_standoff_from_which_the_arm_cannot_move_straight_is_refused(standoff_m: float) -> None:
-    with pytest.raises(ValueError, match=rf"standoff_m {standoff_m} m leads out .* lower it"):
+def test_poses_out_of_reach_between_those_of_an_even_grid_are_refused() -> None:
+    # Only straight ahead and level with the shoulder is x = 0.804 m too near; neither y = 0 nor
+    # yaw = 0 is a seventh of these ranges, and z = 0.675 m is none of theirs.
+    workspace = Workspace(x_m=(0.804, 1.3), y_m=(-0.375, 0.525), yaw_deg=(-35.0, 45.0))
+    _, reach = INVERSE(np.array([0.804, 0.0, ROBOT.link_origins[1][2, 3]]), np.array(0.0))
+    assert not reach
+    with pytest.raises(ValueError, match=r"worst by 4\.\d mm \(x 0\.804 m, y 0\.000 m, z 0\.675 m"):
+        Arm(ROBOT, workspace, 0.1)
+    Arm(ROBOT, workspace.model_copy(update={"x_m": (0.809, 1.3)}), 0.1)
+
+
+@pytest.mark.parametrize("arm", [ARM, DIRECT])
+def test_a_pose_out_of_reach_is_never_said_to_be_reached(arm: Arm) -> None:
+    tooltip_m, yaw_rad = np.array([[1.0, 0.0, 0.8], [0.7, 0.1, 0.8]]), np.array([0.0, 0.2])
+    with pytest.raises(ValueError, match=r"^x 0\.700 m, y 0\.100 m, .*11\.5 deg is out of the arm"):
+        arm.reach(arm.home(2), tooltip_m, yaw_rad)
+
+
+def test_a_standoff_from_which_the_arm_cannot_move_straight_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"standoff_m 0\.3 m leads out .* by [\d.]+ mm; lower"):
+        Arm(ROBOT, Workspace(), 0.3)
+
+
+def test_a_standoff_further_than_any_pose_allows_is_refused_with_the_furthest() -> None:
+    near = Workspace(x_m=(0.85, 0.86), y_m=(-0.01, 0.01), z_m=(0.6, 0.601), yaw_deg=(-1, 1))
+    with pytest.raises(ValueError, match=r"standoff_m 0\.3 m is longer than") as caught:
+        Arm(ROBOT, near, 0.3)
+    found = re.search(r"lower it to ([\d.]+) m at most", str(caught.value))
+    assert found is not None
+    steps = np.arange(0.0, 0.3, 1e-3)
+    tooltip_m = np.array([0.86, 0.0, 0.601]) - steps[:, None] * [1.0, 0.0, 0.0]
+    _, reach = INVERSE(tooltip_m, np.zeros(len(steps)))
+    assert float(found[1]) == pytest.approx(steps[reach].max(), abs=0.003)
+
+
+@pytest.mark.parametrize("standoff_m", [-0.1, 1.001, 100.0, float("inf"), float("nan")])
+def test_a_standoff_that_is_no_length_is_refused(standoff_m: float) -> None:
+    with pytest.raises(ValueError, match=rf"standoff_m {standoff_m} m: no arm"):
         Arm(ROBOT, Workspace(), standoff_m)
 
 
