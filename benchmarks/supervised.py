@@ -41,7 +41,7 @@ from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import to_tensors
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import RunSettings, load_run
-from trainers.session import build_environment, build_factory
+from trainers.session import build_environment, build_factory, set_parameters
 
 Policy = ActorCritic | DeterministicActorCritic
 
@@ -181,7 +181,7 @@ def _environment(run: RunSettings, seed: int) -> GraspVectorEnv:
             "environment.type: only the grasp task knows the right actions; fit a run file with "
             "`environment: {type: grasp}`"
         )
-    env.set_parameters(final_parameters(run))
+    set_parameters(env, final_parameters(run))
     return env
 
 

@@ -32,7 +32,12 @@ from trainers.runfile.settings import RunSettings, load_run
 from trainers.saving.checkpoint import Loaded
 from trainers.saving.evaluation_folder import EVALUATION, EvaluationFolder
 from trainers.saving.run_folder import CONFIGURATION, find_checkpoint, run_folder
-from trainers.session import build_curriculum, build_environment, build_factory
+from trainers.session import (
+    build_curriculum,
+    build_environment,
+    build_factory,
+    set_parameters,
+)
 
 # Run files take seeds below this, so that no run was ever trained on an evaluation's episodes.
 FIRST_SEED = 2**32
@@ -99,7 +104,7 @@ def evaluate(
     """
     run, loaded, registries = find_run(policy, overrides, results_dir)
     with closing(build_environment(run, FIRST_SEED + 2 * seed)) as env, ExitStack() as stack:
-        env.set_parameters(final_parameters(run))
+        set_parameters(env, final_parameters(run))
         player = _policy(run, registries, env, loaded, seed)
         evaluator = env.evaluator()
         physical, pictures, gallery = None, None, None
@@ -161,7 +166,7 @@ def evaluation_environment(run: RunSettings, episodes: int) -> Environment:
         few = replace(run.environment, settings=settings.model_copy(update={"num_envs": episodes}))
         run = replace(run, environment=few)
     env = build_environment(run, FIRST_SEED)
-    env.set_parameters(final_parameters(run))
+    set_parameters(env, final_parameters(run))
     return env
 
 

@@ -146,15 +146,24 @@ class Session:
         return {**self._parameters, **lesson}
 
     def _check_parameters(self, env: Environment) -> None:
-        sources = {"environment_parameters": self._parameters}
+        """Refuses parameters of the first and of the last lesson that the environment refuses.
+
+        Otherwise the run would end when a lesson begins.
+        """
+        first: dict[str, ParameterValue] = {}
+        last: dict[str, ParameterValue] = {}
         if self.curriculum is not None:
-            sources["curriculum"] = self.curriculum.parameters(self._curriculum_state)
+            first = self.curriculum.parameters(self._curriculum_state)
+            last = self.curriculum.final_parameters()
+        sources = {"environment_parameters": self._parameters, "curriculum": {**first, **last}}
         for path, parameters in sources.items():
             for name in sorted(set(parameters) - env.parameter_names):
                 raise UserError(
                     f"{path}: the environment has no parameter {name!r}; "
                     f"{suggestion(name, env.parameter_names)}"
                 )
+        for lesson in (last, first):
+            set_parameters(env, {**self._parameters, **lesson})
 
 
 def resolve_device(name: str) -> torch.device:
@@ -184,6 +193,18 @@ def build_environment(run: RunSettings, seed: int) -> Environment:
     ]
     env: Environment = _build(run.environment, "environment", terms, seed)
     return env
+
+
+def set_parameters(env: Environment, parameters: Mapping[str, ParameterValue]) -> None:
+    """Sets environment parameters of the run file.
+
+    Raises:
+        UserError: the environment refuses a value.
+    """
+    try:
+        env.set_parameters(parameters)
+    except ValueError as error:
+        raise UserError(str(error)) from error
 
 
 def build_curriculum(run: RunSettings) -> Curriculum | None:

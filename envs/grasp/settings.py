@@ -29,6 +29,7 @@ Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 MIN_CONTACT_RESOLUTION_M = 1e-6
 # Well under the thinnest bar of a block, so that nothing is passed through.
 MAX_CONTACT_RESOLUTION_M = 0.02
+MAX_NOISE_SIGMA_M = 1.0
 # About as far as the arm can go straight ahead at all.
 MAX_STANDOFF_M = 1.0
 
@@ -70,7 +71,10 @@ class Camera(BaseModel, frozen=True, extra="forbid"):
     far_m: Range = Field((2.5, 3.0), description="Far clip plane, drawn at every reset.")
     range_m: Range = Field((0.4, 2.0), description="Depth only: the sensor's measuring range.")
     noise_sigma_m: float = Field(
-        0.002, ge=0.0, le=1.0, description="Depth only: sigma of the Gaussian noise."
+        0.002,
+        ge=0.0,
+        le=MAX_NOISE_SIGMA_M,
+        description="Depth only: sigma of the Gaussian noise.",
     )
     missing_fraction: Range = Field(
         (0.0, 0.0),

@@ -21,20 +21,21 @@ from envs.grasp.episode_state import RunningEpisodes
 from envs.grasp.evaluation.evaluator import EVALUATION_OPTIONS, GraspEvaluator
 from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.observations import PRIVILEGED, observation_space, privileged_state
+from envs.grasp.parameters import (
+    GOAL_PARAMETERS,
+    SENSOR_PARAMETERS,
+    YAW_LIMIT,
+    parameter_ranges,
+)
 from envs.grasp.robot.arm import Arm
 from envs.grasp.robot.urdf import load_robot
-from envs.grasp.scene.sampler import Scenes, SceneSampler, check_yaw_limit, yaw_limit_range
+from envs.grasp.scene.sampler import Scenes, SceneSampler
 from envs.grasp.sensors.camera import CameraPoses, overviews
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.factory import make_simulator
 from envs.grasp.task import EpisodeProgress, GoalRegion, Motion, advance, judge
 from rewards.grasp.transition import GraspTransition
 from rewards.reward import RewardTerm, fitting, weigh
-
-GOAL_PARAMETERS = ("lateral_limit_m", "vertical_limit_m", "gap_limit_m", "yaw_limit_deg")
-# Those of the depth cameras' sensors, and what a sampler's numbers are clipped to.
-SENSOR_PARAMETERS = {"noise_sigma_m": (0.0, np.inf), "missing_fraction": (0.0, 1.0)}
-YAW_LIMIT = "block_yaw_limit_deg"
 
 
 class GraspVectorEnv(Environment):
@@ -80,6 +81,7 @@ class GraspVectorEnv(Environment):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._parameters: dict[str, ParameterValue] = {}
+        self._parameter_ranges = parameter_ranges(settings)
         self._arm = Arm.of(settings, load_robot())
         self._sampler = SceneSampler(settings)
         self._everyone = np.arange(self.num_envs)
@@ -151,11 +153,12 @@ class GraspVectorEnv(Environment):
         """See `Environment.set_parameters`.
 
         Raises:
-            ValueError: there is no such parameter, or the blocks have no yaw within its limit.
+            ValueError: there is no such parameter, or a value makes no sense or success impossible;
+                see `envs.grasp.parameters`.
         """
         super().set_parameters(parameters)
-        if YAW_LIMIT in parameters:
-            check_yaw_limit(parameters[YAW_LIMIT], self._settings.randomize.block_yaw_deg)
+        for name, value in parameters.items():
+            self._parameter_ranges[name].check(name, value)
         self._parameters = dict(parameters)
 
     def state_dict(self) -> dict[str, Any]:
@@ -226,16 +229,15 @@ class GraspVectorEnv(Environment):
     def _begin(self, indices: NDArray[np.int64]) -> None:
         """Begins new episodes in some environments."""
         n = len(indices)
-        given = {name: draw(value, self._rng, n) for name, value in self._parameters.items()}
-        limits = {name: given[name] for name in GOAL_PARAMETERS if name in given}
-        least, most = yaw_limit_range(self._settings.randomize.block_yaw_deg)
-        yaw_limit_rad = np.radians(np.clip(given.get(YAW_LIMIT, np.full(n, most)), least, most))
-        scenes, views = self._sampler.sample(self._rng, yaw_limit_rad)
-        sensor = {
-            name: given[name].clip(*ends)
-            for name, ends in SENSOR_PARAMETERS.items()
-            if name in given
+        given = {
+            name: self._parameter_ranges[name].clip(draw(value, self._rng, n))
+            for name, value in self._parameters.items()
         }
+        limits = {name: given[name] for name in GOAL_PARAMETERS if name in given}
+        sensor = {name: given[name] for name in SENSOR_PARAMETERS if name in given}
+        whole_yaw = np.full(n, self._parameter_ranges[YAW_LIMIT].high)
+        yaw_limit_rad = np.radians(given.get(YAW_LIMIT, whole_yaw))
+        scenes, views = self._sampler.sample(self._rng, yaw_limit_rad)
         views = {name: view.with_arrays(sensor) for name, view in views.items()}
         tools = self._arm.home(n)
         self._simulator.load(indices, scenes, tools.joints_rad)

@@ -77,6 +77,25 @@ def test_unknown_environment_parameters_name_where_they_stand(
     assert message == ("curriculum: the environment has no parameter 'size'; known: scale, shift")
 
 
+@pytest.mark.parametrize("lesson", [0, 2])
+def test_a_lessons_value_that_the_environment_refuses_ends_the_run_before_it_begins(
+    make_run: MakeRun, registries: Registries, monkeypatch: pytest.MonkeyPatch, lesson: int
+) -> None:
+    lessons = copy.deepcopy(LESSONS)
+    lessons["lessons"][lesson]["parameters"]["scale"] = -1.0  # type: ignore[index]
+    run = make_run("target", curriculum=lessons)
+    accept = run.environment.cls.set_parameters
+
+    def choosy(self: Any, parameters: dict[str, Any]) -> None:
+        if parameters["scale"] < 0.0:
+            raise ValueError(f"scale {parameters['scale']:g} must be over 0")
+        accept(self, parameters)
+
+    monkeypatch.setattr(run.environment.cls, "set_parameters", choosy)
+    with pytest.raises(UserError, match=r"^scale -1 must be over 0$"):
+        Session(run, registries)
+
+
 @pytest.mark.parametrize(
     "device", ["cuda:77", "gpu", "cuda" if not torch.cuda.is_available() else "x"]
 )

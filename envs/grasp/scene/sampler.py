@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from curricula.samplers import ParameterValue
 from envs.grasp.batch import Batch
 from envs.grasp.scene.placement import place_blocks, rules
 from envs.grasp.sensors.camera import CameraPoses, sample_views
@@ -60,34 +59,6 @@ def to_world(points_m: Floats, position_m: Floats, yaw_rad: Floats) -> Floats:
     x, y, z = np.moveaxis(points_m, -1, 0)
     turned = np.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=-1)
     return turned + position_m[..., None, :]
-
-
-def yaw_limit_range(block_yaw_deg: tuple[float, float]) -> tuple[float, float]:
-    """The smallest and the largest limit +- of the blocks' yaw that narrow its range, in degrees.
-
-    Below the first none of the range is left, over the second all of it.
-    """
-    low, high = block_yaw_deg
-    return max(low, -high, 0.0), max(abs(low), abs(high))
-
-
-def check_yaw_limit(value: ParameterValue, block_yaw_deg: tuple[float, float]) -> None:
-    """Refuses limits that a run file gives the blocks' yaw, a number or a sampler, in degrees.
-
-    A Gaussian has no limits of its own; what it draws is clipped to `yaw_limit_range`.
-
-    Raises:
-        ValueError: there would be no yaw within a limit, or a limit would limit nothing.
-    """
-    least, most = yaw_limit_range(block_yaw_deg)
-    low, high = (value, value) if isinstance(value, int | float) else value.limits
-    if (low < least or high > most) and np.isfinite(low):
-        raise ValueError(
-            f"environment parameter block_yaw_limit_deg {low:g}{f' to {high:g}' * (high > low)}: "
-            f"the blocks' yaw goes from {block_yaw_deg[0]:g} to {block_yaw_deg[1]:g} deg "
-            f"(environment.randomize.block_yaw_deg), which leaves {least:g} to {most:g}; change "
-            "one of the two"
-        )
 
 
 class SceneSampler:
