@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,12 @@ from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Camera
 from envs.grasp.task import EpisodeProgress, GoalRegion
 
-BATCHES = {"scenes": Scenes, "region": GoalRegion, "tools": Tools, "progress": EpisodeProgress}
+BATCHES: dict[str, Any] = {
+    "scenes": Scenes,
+    "region": GoalRegion,
+    "tools": Tools,
+    "progress": EpisodeProgress,
+}
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,16 @@ class RunningEpisodes:
     def from_state_dict(
         cls, state: Mapping[str, Any], cameras: Mapping[str, Camera]
     ) -> RunningEpisodes:
-        """The episodes of a `state_dict`."""
+        """The episodes of a `state_dict`.
+
+        Raises:
+            ValueError: it has other arrays, or other cameras.
+        """
+        for name, batch in BATCHES.items():
+            _check_names(name, state.get(name, {}), batch)
+        _check_equal("cameras", state.get("views", {}), cameras)
+        for name, arrays in state["views"].items():
+            _check_names(f"views.{name}", arrays, CameraPoses)
         return cls(
             **{name: batch(**state[name]) for name, batch in BATCHES.items()},
             views={
@@ -72,4 +86,19 @@ class RunningEpisodes:
                 for name, camera in cameras.items()
             },
             images=dict(state["images"]),
+        )
+
+
+def _check_names(path: str, arrays: Mapping[str, Any], batch: Any) -> None:
+    """Raises ValueError where arrays are not those of a batch."""
+    names = {field.name for field in fields(batch)} - {"camera"}
+    _check_equal(path, arrays, names)
+
+
+def _check_equal(path: str, found: Iterable[str], expected: Iterable[str]) -> None:
+    if differing := sorted(set(found) ^ set(expected)):
+        raise ValueError(
+            f"the saved episodes are of another version of the grasp task: {path} differs in "
+            f"{', '.join(differing)}; begin new ones, from the run's weights, with "
+            "--initialize-from"
         )

@@ -166,9 +166,15 @@ class GraspVectorEnv(Environment):
         return {"rng": self._rng.bit_generator.state, **self._running().state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> ObservationArrays:
-        """See `Environment.load_state_dict`."""
+        """See `Environment.load_state_dict`.
+
+        Raises:
+            ValueError: the state is of another task.
+        """
+        episodes = RunningEpisodes.from_state_dict(state, self._settings.cameras)
+        self._arm.check(episodes.tools)
         self._rng.bit_generator.state = state["rng"]
-        self._episodes = episodes = RunningEpisodes.from_state_dict(state, self._settings.cameras)
+        self._episodes = episodes
         self._simulator.load(self._everyone, episodes.scenes, episodes.tools.joints_rad)
         return self._observations()
 

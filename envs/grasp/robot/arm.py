@@ -96,6 +96,19 @@ class Arm:
             np.tile(self._home_axis, (n, 1)),
         )
 
+    def check(self, tools: Tools) -> None:
+        """Refuses tools that came in on another arm's ways.
+
+        Raises:
+            ValueError: their ways have another number of knots.
+        """
+        knots, expected = tools.approach_rad.shape[1], self._approach.knots
+        if knots != expected:
+            raise ValueError(
+                f"the tools came in on ways of {knots} knots, and this arm's have {expected}: "
+                "environment.standoff_m or environment.motion is another than theirs"
+            )
+
     def pose(self, actions: Floats) -> tuple[Floats, Floats]:
         """Tooltip (N, 3) and yaw (N,) that actions (N, 4) in [-1, 1] stand for."""
         clipped = np.clip(actions, -1.0, 1.0)

@@ -657,6 +657,42 @@ def test_a_state_can_be_gone_back_to_in_the_same_environment(make: MakeEnv) -> N
     same(play(env, 6, 1), expected)
 
 
+@pytest.mark.parametrize(
+    ("part", "old", "new", "words"),
+    [
+        # Tools without the ways on which they came in, and cameras that miss no pixels.
+        ("tools", {"joints_rad": np.zeros((2, 6))}, "approach_rad", "approach_rad, joints_rad"),
+        ("views.depth", {}, "missing_fraction", "missing_fraction"),
+        ("cameras", {}, None, "above, depth"),
+    ],
+)
+def test_the_state_of_another_versions_task_is_refused(
+    make: MakeEnv, part: str, old: dict[str, Any], new: str | None, words: str
+) -> None:
+    env = make(2)
+    env.reset(seed=0)
+    before, state = env.state_dict(), env.state_dict()
+    if part == "cameras":
+        state["views"] = {"above": state["views"]["depth"]}
+    else:
+        arrays = state["tools"] if part == "tools" else state["views"]["depth"]
+        del arrays[new]
+        arrays.update(old)
+    message = f"another version of the grasp task: {part} differs in {words}; .*--initialize-from"
+    with pytest.raises(ValueError, match=message):
+        env.load_state_dict(state)
+    same(env.state_dict(), before)
+
+
+@pytest.mark.parametrize("other", [{"motion": "direct"}, {"standoff_m": 0.15}])
+def test_the_state_of_another_standoff_is_refused(make: MakeEnv, other: dict[str, Any]) -> None:
+    workspace = {"x_m": (1.0, 1.3), "yaw_deg": (-20.0, 20.0)}
+    env, another = make(2, standoff_m=0.25, workspace=workspace), make(2, **other)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"7 knots, .* environment\.standoff_m or .*\.motion"):
+        another.load_state_dict(env.state_dict())
+
+
 def test_the_robots_stand_where_the_state_has_them() -> None:
     settings = GraspSettings(num_envs=2, workers=0, cameras=SMALL)
     env = GraspVectorEnv(settings, [], render_mode="rgb_array")
