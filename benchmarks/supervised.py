@@ -27,7 +27,6 @@ from torch.nn import functional as F
 
 from benchmarks.command import tells_mistakes
 from envs.grasp.scene.sampler import heading
-from envs.grasp.task import goal_middle_m
 from envs.grasp.vector_env import GraspVectorEnv
 from trainers.algorithms.ddpg import DDPGSettings
 from trainers.algorithms.ppo import PPOSettings
@@ -104,7 +103,6 @@ def fit(
     """
     parameters = list(policy.actor_parameters())
     optimizer = torch.optim.Adam(parameters, fused=True)
-    tolerances = _tolerances(env)
     begin, pauses, steps, reports = time.perf_counter(), 0.0, 0, 0
     while True:
         share = (time.perf_counter() - begin - pauses) / seconds
@@ -118,7 +116,7 @@ def fit(
         warmth = min(1.0, (steps + 1) / WARM_UP_STEPS)
         for group in optimizer.param_groups:
             group["lr"] = learning_rate * warmth * (1.0 + math.cos(math.pi * share)) / 2.0
-        error = (_actions(policy, env) - torch.from_numpy(right_actions(env))) / tolerances
+        error = (_actions(policy, env) - torch.from_numpy(right_actions(env))) / _tolerances(env)
         optimizer.zero_grad()
         F.smooth_l1_loss(error, torch.zeros_like(error)).backward()
         torch.nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
@@ -149,7 +147,7 @@ def judge(policy: Policy, env: GraspVectorEnv) -> dict[str, str]:
 
 def right_actions(env: GraspVectorEnv) -> NDArray[np.float32]:
     """The actions (N, 4) that lead to the middles of the goal regions."""
-    scenes, gap_m = env.scenes, goal_middle_m(env.settings.goal)[2]
+    scenes, gap_m = env.scenes, env.region.middle_m[:, 2:]
     goal_m = scenes.target_m - gap_m * heading(scenes.target_yaw_rad)
     return env.action_for(goal_m, scenes.target_yaw_rad).astype(np.float32)
 
@@ -164,13 +162,12 @@ def _actions(policy: Policy, env: GraspVectorEnv) -> Tensor:
 
 
 def _tolerances(env: GraspVectorEnv) -> Tensor:
-    """How large an error (4,) of an action the goal region allows."""
-    goal, workspace = env.settings.goal, env.settings.workspace
-    depth_m = (goal.gap_limit_m - goal.gap_min_m) / 2
-    allowed = [depth_m, goal.lateral_limit_m, goal.vertical_limit_m, goal.yaw_limit_deg]
-    return torch.tensor(
-        [2.0 * a / (high - low) for a, (_, (low, high)) in zip(allowed, workspace, strict=True)]
-    )
+    """How large errors (N, 4) of the actions the goal regions allow."""
+    region, workspace = env.region, env.settings.workspace
+    depth_m = (region.gap_limit_m - region.gap_min_m) / 2
+    allowed = [depth_m, region.lateral_limit_m, region.vertical_limit_m, region.yaw_limit_deg]
+    parts = [2.0 * a / (high - low) for a, (_, (low, high)) in zip(allowed, workspace, strict=True)]
+    return torch.from_numpy(np.stack(parts, axis=1).astype(np.float32))
 
 
 def _environment(run: RunSettings, seed: int) -> GraspVectorEnv:

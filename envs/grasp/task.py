@@ -53,11 +53,6 @@ class GoalRegion(Batch):
         )
 
 
-def goal_middle_m(goal: Goal) -> Floats:
-    """The middle (3,) of a goal region, in the block frame."""
-    return GoalRegion.like(goal, 1).middle_m[0]
-
-
 @dataclass(frozen=True)
 class EpisodeProgress(Batch):
     """Progress of N running episodes; arrays (N,)."""

@@ -182,7 +182,7 @@ class GraspVectorEnv(Environment):
 
     def evaluator(self) -> GraspEvaluator:
         """See `Environment.evaluator`."""
-        return GraspEvaluator(self._settings, self._pose_commands)
+        return GraspEvaluator(self._settings, self._arm, self._pose_commands)
 
     # -- the task --------------------------------------------------------------------------------
 
@@ -195,6 +195,11 @@ class GraspVectorEnv(Environment):
     def scenes(self) -> Scenes:
         """The running episodes' scenes."""
         return self._running().scenes
+
+    @property
+    def region(self) -> GoalRegion:
+        """The running episodes' goal regions."""
+        return self._running().region
 
     def action_for(self, tooltip_m: NDArray[Any], yaw_rad: NDArray[Any]) -> NDArray[np.float64]:
         """The actions (N, 4) that lead to tooltips (N, 3) and yaws (N,)."""

@@ -19,7 +19,6 @@ from envs.grasp.evaluation.pick import PickCheck, Picker
 from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.evaluation.report import GraspReport
 from envs.grasp.robot.arm import Arm
-from envs.grasp.robot.urdf import load_robot
 from envs.grasp.settings import GraspSettings
 
 MM_PER_M = 1000.0
@@ -35,6 +34,7 @@ class GraspEvaluator(Evaluator):
 
     Args:
         settings: the task.
+        arm: the robot.
         commands: where actions would lead in the running episodes.
     """
 
@@ -50,16 +50,20 @@ class GraspEvaluator(Evaluator):
     judges_first_action = True
     check_name = "pick"
 
-    def __init__(self, settings: GraspSettings, commands: Callable[[NDArray[Any]], PoseCommands]):
-        self._settings, self._pose_commands = settings, commands
+    def __init__(
+        self,
+        settings: GraspSettings,
+        arm: Arm,
+        commands: Callable[[NDArray[Any]], PoseCommands],
+    ):
+        self._settings, self._arm, self._pose_commands = settings, arm, commands
 
     def physical_check(self, *, window: bool = False) -> PickCheck:
         """The pick; see `envs.grasp.evaluation.pick`."""
         settings = self._settings
-        arm = Arm.of(settings, load_robot())
-        picker = Picker(arm, settings.support, settings.pick, window)
+        picker = Picker(self._arm, settings.support, settings.pick, window)
         return PickCheck(picker, self._pose_commands)
 
     def pictures(self) -> GraspReport:
         """Scenes, errors and a film; see `envs.grasp.evaluation.report`."""
-        return GraspReport(self._settings, self._pose_commands)
+        return GraspReport(self._settings, self._arm, self._pose_commands)

@@ -11,7 +11,6 @@ from PIL import Image, ImageDraw, ImageFont
 from envs.grasp.evaluation.pick import STEP_S, Attempt, Picker
 from envs.grasp.evaluation.pose_errors import Sample
 from envs.grasp.robot.arm import Arm
-from envs.grasp.robot.urdf import load_robot
 from envs.grasp.sensors.camera import overviews
 from envs.grasp.settings import GraspSettings
 
@@ -28,12 +27,13 @@ LIGHT = {
 }
 
 
-def film(shots: Sequence[Sample], settings: GraspSettings, pick: bool) -> bytes:
+def film(samples: Sequence[Sample], settings: GraspSettings, arm: Arm, pick: bool) -> bytes:
     """Films some commands one after the other, from the robot's home on.
 
     Args:
-        shots: what to film, one or more.
+        samples: what to film, one or more.
         settings: the task.
+        arm: carries them out.
         pick: go on to pick up the block; otherwise the film ends at the commanded pose.
 
     Returns:
@@ -41,12 +41,12 @@ def film(shots: Sequence[Sample], settings: GraspSettings, pick: bool) -> bytes:
     """
     frames: list[Image.Image] = []
     durations: list[int] = []
-    picker = Picker(Arm.of(settings, load_robot()), settings.support, settings.pick)
+    picker = Picker(arm, settings.support, settings.pick)
     try:
-        for number, shot in enumerate(shots, 1):
-            captured = _Camera(f"{number} of {len(shots)}   {shot.caption}")
+        for number, sample in enumerate(samples, 1):
+            captured = _Camera(f"{number} of {len(samples)}   {sample.caption}")
             carry_out = picker.pick if pick else picker.reach
-            carry_out(shot.scene.with_arrays(LIGHT), shot.tooltip_m, shot.yaw_rad, captured)
+            carry_out(sample.scene.with_arrays(LIGHT), sample.tooltip_m, sample.yaw_rad, captured)
             frames += captured.frames
             durations += [FRAME_MS] * (len(captured.frames) - 1) + [LAST_FRAME_MS]
     finally:

@@ -1,4 +1,4 @@
-"""Figures of an evaluation, as PNG: what the policy saw and where it aimed, and its errors."""
+"""Figures of an evaluation, as PNG: what the policy saw and commanded, and its errors."""
 
 from __future__ import annotations
 
@@ -17,17 +17,15 @@ from numpy.typing import NDArray
 from encoders.spaces import NOTHING_SEEN
 from envs.grasp.evaluation.pick import Outcome
 from envs.grasp.evaluation.pose_errors import PoseErrors, Sample, outcome_label
-from envs.grasp.robot.urdf import load_robot
 from envs.grasp.scene.sampler import heading
-from envs.grasp.sensors.camera import project
-from envs.grasp.settings import Goal
+from envs.grasp.sensors.camera import CameraPoses, project
 
 Floats = NDArray[np.float64]
 
 COLUMNS = 6
 STEM_M = 0.08
 RIM_POINTS = 48
-TRUE_COLOR, AIM_COLOR = "white", "magenta"
+TRUE_COLOR, COMMAND_COLOR = "white", "magenta"
 NOTHING_SEEN_COLOR = "gray"
 GOOD_COLOR, BAD_COLOR = "tab:green", "tab:red"
 OUTCOME_COLORS = {
@@ -45,26 +43,31 @@ FARTHEST_PERCENTILE = 97.0
 DPI = 110
 
 
-def contact_sheet(shots: Sequence[Sample], goal_m: Floats) -> bytes:
+def contact_sheet(samples: Sequence[Sample], cup_radius_m: float) -> bytes:
     """Camera pictures, with the cup drawn at the goal and where the policy sent it.
 
     Args:
-        shots: the episodes, one or more.
-        goal_m: (3,) middle of the goal region, in the block frame.
+        samples: the episodes, one or more. The goal is the middle of an episode's own region.
+        cup_radius_m: of the cup's rim.
     """
-    rows = math.ceil(len(shots) / COLUMNS)
+    rows = math.ceil(len(samples) / COLUMNS)
     figure = Figure(figsize=(2.0 * COLUMNS, 2.25 * rows + 0.5), layout="constrained")
     grid = figure.subplots(rows, COLUMNS, squeeze=False)
     for axes in grid.flat:
         axes.axis("off")
-    for axes, shot in zip(grid.flat, shots, strict=False):
-        _show(axes, shot.image)
-        true_yaw_rad = float(shot.scene.target_yaw_rad[0])
-        goal = shot.scene.target_m[0] + _in_world(goal_m, true_yaw_rad)
-        _draw_cup(axes, shot, goal, true_yaw_rad, TRUE_COLOR)
-        _draw_cup(axes, shot, shot.tooltip_m, shot.yaw_rad, AIM_COLOR)
-        good = shot.judged.outcome[0] in ("", "success")
-        axes.set_title(shot.caption, fontsize=8, color="black" if good else BAD_COLOR)
+    for axes, sample in zip(grid.flat, samples, strict=False):
+        _show(axes, sample.image)
+        true_yaw_rad = float(sample.scene.target_yaw_rad[0])
+        middle_m = sample.errors.region.middle_m[0]
+        goal_m = sample.scene.target_m[0] + _in_world(middle_m, true_yaw_rad)
+        for tooltip_m, yaw_rad, color in (
+            (goal_m, true_yaw_rad, TRUE_COLOR),
+            (sample.tooltip_m, sample.yaw_rad, COMMAND_COLOR),
+        ):
+            rim, stem = _cup(tooltip_m, yaw_rad, cup_radius_m)
+            _draw_lines(axes, sample.view, (rim, stem), color)
+        good = sample.errors.outcome[0] in ("", "success")
+        axes.set_title(sample.caption, fontsize=8, color="black" if good else BAD_COLOR)
     figure.suptitle(
         "The cup at the goal (white) and where the policy sends it (magenta); "
         "the line is the tool's axis",
@@ -73,40 +76,46 @@ def contact_sheet(shots: Sequence[Sample], goal_m: Floats) -> bytes:
     return _png(figure)
 
 
-def error_histograms(judged: PoseErrors, goal: Goal) -> bytes:
-    """Signed errors of the commands, in the block frame, with the goal region shaded."""
-    half_gap_mm = (goal.gap_limit_m - goal.gap_min_m) / 2 * 1000.0
-    lateral, vertical, gap = judged.error_m.T * 1000.0
+def error_histograms(errors: PoseErrors) -> bytes:
+    """Signed errors of the commands, in the block frame, with the goal region shaded.
+
+    Where the episodes' regions differ, the shaded one has their mean limits.
+    """
+    region = errors.region
+    half_gap_m = (region.gap_limit_m - region.gap_min_m) / 2.0
+    lateral, vertical, gap = errors.error_m.T * 1000.0
     panels = (
-        ("sideways", lateral, goal.lateral_limit_m * 1000.0, "mm"),
-        ("up", vertical, goal.vertical_limit_m * 1000.0, "mm"),
-        ("gap", gap, half_gap_mm, "mm"),
-        ("yaw", judged.yaw_error_deg, goal.yaw_limit_deg, "deg"),
+        ("sideways", lateral, region.lateral_limit_m * 1000.0, "mm"),
+        ("up", vertical, region.vertical_limit_m * 1000.0, "mm"),
+        ("gap", gap, half_gap_m * 1000.0, "mm"),
+        ("yaw", errors.yaw_error_deg, region.yaw_limit_deg, "deg"),
     )
     figure = Figure(figsize=(9.0, 6.0), layout="constrained")
-    for axes, (name, errors, limit, unit) in zip(figure.subplots(2, 2).flat, panels, strict=True):
-        reach = max(float(np.percentile(np.abs(errors), SHOWN_PERCENTILE)), 1.5 * limit)
+    for axes, (name, off, limits, unit) in zip(figure.subplots(2, 2).flat, panels, strict=True):
+        limit = float(limits.mean())
+        reach = max(float(np.percentile(np.abs(off), SHOWN_PERCENTILE)), 1.5 * limit)
         axes.axvspan(-limit, limit, color=GOOD_COLOR, alpha=0.2, linewidth=0)
-        axes.hist(errors, BINS, range=(-reach, reach), color="tab:blue")
-        inside = np.mean(np.abs(errors) <= limit)
+        axes.hist(off, BINS, range=(-reach, reach), color="tab:blue")
+        inside = np.mean(np.abs(off) <= limits)
+        width = f"±{limit:.3g} {unit}" if np.ptp(limits) == 0.0 else "their limits"
         axes.set_title(
-            f"{name}: {np.median(np.abs(errors)):.1f} {unit} off in the median, "
-            f"{inside:.0%} within ±{limit:.3g} {unit}",
+            f"{name}: {np.median(np.abs(off)):.1f} {unit} off in the median, "
+            f"{inside:.0%} within {width}",
             fontsize=9,
         )
         axes.set(xlabel=f"{name} error ({unit})", ylabel="episodes", xlim=(-reach, reach))
-    figure.suptitle(f"First actions: {len(judged.error_m)} episodes", fontsize=10)
+    figure.suptitle(f"First actions: {len(errors.error_m)} episodes", fontsize=10)
     return _png(figure)
 
 
-def workspace(judged: PoseErrors) -> bytes:
+def workspace(errors: PoseErrors) -> bytes:
     """Errors over the positions on the support, and over the yaws."""
     figure = Figure(figsize=(11.0, 4.4), layout="constrained")
     above, turned = figure.subplots(1, 2, width_ratios=(1.3, 1.0))
-    distance_mm = judged.distance_m * 1000.0
+    distance_mm = errors.distance_m * 1000.0
     dots = above.scatter(
-        judged.target_m[:, 1],
-        judged.target_m[:, 0],
+        errors.target_m[:, 1],
+        errors.target_m[:, 0],
         c=distance_mm,
         s=14,
         cmap="viridis",
@@ -119,14 +128,14 @@ def workspace(judged: PoseErrors) -> bytes:
     above.set_title("position error over the support, from above", fontsize=9)
     figure.colorbar(dots, ax=above, location="bottom", label="position error (mm)")
     for outcome, color in OUTCOME_COLORS.items():
-        rows = judged.outcome == outcome
+        rows = errors.outcome == outcome
         if rows.any():
-            yaw, error = judged.target_yaw_deg[rows], judged.yaw_error_deg[rows]
-            turned.scatter(yaw, error, s=10, color=color, label=outcome_label(outcome))
+            yaw, yaw_error = errors.target_yaw_deg[rows], errors.yaw_error_deg[rows]
+            turned.scatter(yaw, yaw_error, s=10, color=color, label=outcome_label(outcome))
     turned.axhline(0.0, color="gray", linewidth=0.8)
-    if judged.outcome[0]:
+    if errors.outcome[0]:
         turned.legend(fontsize=8)
-    reach = max(float(np.percentile(np.abs(judged.yaw_error_deg), SHOWN_PERCENTILE)), 1.0)
+    reach = max(float(np.percentile(np.abs(errors.yaw_error_deg), SHOWN_PERCENTILE)), 1.0)
     turned.set(xlabel="target yaw (deg)", ylabel="yaw error (deg)", ylim=(-reach, reach))
     turned.set_title("yaw error over the target's yaw", fontsize=9)
     return _png(figure)
@@ -150,15 +159,18 @@ def _show(axes: Axes, image: NDArray[Any]) -> None:
     axes.set(xlim=(0, width), ylim=(height, 0))
 
 
-def _draw_cup(axes: Axes, shot: Sample, tooltip_m: Floats, yaw_rad: float, color: str) -> None:
-    """Draws the cup's rim, and its axis back towards the robot."""
+def _cup(tooltip_m: Floats, yaw_rad: float, radius_m: float) -> tuple[Floats, Floats]:
+    """The cup's rim (k, 3), and its axis (2, 3) back towards the robot."""
     angle = np.linspace(0.0, 2.0 * math.pi, RIM_POINTS)[:, None]
     ahead, up = heading(np.array(yaw_rad)), np.array([0.0, 0.0, 1.0])
-    radius_m = load_robot().cup_radius_m
     rim = tooltip_m + radius_m * (np.cos(angle) * np.cross(up, ahead) + np.sin(angle) * up)
-    stem = np.stack([tooltip_m, tooltip_m - STEM_M * ahead])
-    for points in (rim, stem):
-        u, v, _ = project(shot.view, points[None])[0].T
+    return rim, np.stack([tooltip_m, tooltip_m - STEM_M * ahead])
+
+
+def _draw_lines(axes: Axes, view: CameraPoses, lines: Sequence[Floats], color: str) -> None:
+    """Draws lines (k, 3) of the world into the image of a view."""
+    for points in lines:
+        u, v, _ = project(view, points[None])[0].T
         axes.plot(u, v, color="black", linewidth=2.6)
         axes.plot(u, v, color=color, linewidth=1.6)
 

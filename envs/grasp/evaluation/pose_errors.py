@@ -1,4 +1,4 @@
-"""PoseCommands as they are judged and drawn."""
+"""Errors of commanded poses, and samples of them to be drawn."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from envs.grasp.evaluation.pick import Outcome
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses
+from envs.grasp.task import GoalRegion
 
 Floats = NDArray[np.float64]
 
@@ -22,6 +23,7 @@ class PoseErrors:
     Attributes:
         target_m: (n, 3) grasp points, world frame.
         target_yaw_deg: (n,) yaw that faces the target squarely.
+        region: what counts as right.
         error_m: (n, 3) from the goal region's middle, in the block frame: lateral, vertical, gap.
         yaw_error_deg: (n,) signed.
         outcome: (n,) what the physical check said; empty text where there was none.
@@ -29,9 +31,13 @@ class PoseErrors:
 
     target_m: Floats
     target_yaw_deg: Floats
+    region: GoalRegion
     error_m: Floats
     yaw_error_deg: Floats
     outcome: NDArray[np.str_]
+
+    def __getitem__(self, rows: slice) -> PoseErrors:
+        return PoseErrors(**{name: values[rows] for name, values in vars(self).items()})
 
     @property
     def distance_m(self) -> Floats:
@@ -41,21 +47,21 @@ class PoseErrors:
 
 @dataclass(frozen=True)
 class Sample:
-    """One aim to be drawn by itself: one row of scene and view, its image, and its judgement."""
+    """One command to be drawn by itself: one row of scene, view and errors, and its image."""
 
     scene: Scenes
     view: CameraPoses
     image: NDArray[Any]
     tooltip_m: Floats
     yaw_rad: float
-    judged: PoseErrors
+    errors: PoseErrors
 
     @property
     def caption(self) -> str:
-        """Error of the aim, and what came of it."""
-        judged = self.judged
-        error = f"{judged.distance_m[0] * 1000:.1f} mm, {abs(judged.yaw_error_deg[0]):.1f} deg"
-        return f"{error}   {outcome_label(judged.outcome[0])}".rstrip()
+        """Error of the command, and what came of it."""
+        errors = self.errors
+        error = f"{errors.distance_m[0] * 1000:.1f} mm, {abs(errors.yaw_error_deg[0]):.1f} deg"
+        return f"{error}   {outcome_label(errors.outcome[0])}".rstrip()
 
 
 def outcome_label(outcome: str) -> str:

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.evaluation.pose_errors import PoseErrors, Sample
+from envs.grasp.robot.arm import Arm
 from envs.grasp.settings import GraspSettings
-from envs.grasp.task import block_offset, goal_middle_m, yaw_error
+from envs.grasp.task import GoalRegion, block_offset, yaw_error
 
 Floats = NDArray[np.float64]
 
@@ -26,6 +27,7 @@ class GraspReport:
 
     Args:
         settings: the task.
+        arm: carries out what is filmed.
         commands: where actions would lead in the running episodes.
 
     Raises:
@@ -34,29 +36,34 @@ class GraspReport:
 
     file_names: tuple[str, ...] = ("episodes.png", "errors.png", "workspace.png", "film.gif")
 
-    def __init__(self, settings: GraspSettings, commands: Callable[[NDArray[Any]], PoseCommands]):
+    def __init__(
+        self,
+        settings: GraspSettings,
+        arm: Arm,
+        commands: Callable[[NDArray[Any]], PoseCommands],
+    ):
         if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
             raise ValueError(
                 f"pictures are drawn with {missing[0]}, which is not installed: install ventosa "
                 "with its extra `render`, pip install -e '.[render]'"
             )
-        self._settings, self._pose_commands = settings, commands
+        self._settings, self._arm, self._pose_commands = settings, arm, commands
         cameras = settings.cameras
         depth = [name for name, camera in cameras.items() if camera.type == "depth"]
         self._camera = (depth or list(cameras))[0]
-        self._judged: list[PoseErrors] = []
-        self._shots: list[Sample] = []
+        self._errors: list[PoseErrors] = []
+        self._samples: list[Sample] = []
         self._picked = False
 
     def add(self, actions: NDArray[Any], outcomes: Mapping[str, NDArray[np.bool_]]) -> None:
         """See `EvaluationReport`."""
         commands = self._pose_commands(actions)
-        judged = self._judge(commands, outcomes)
-        self._judged.append(judged)
+        errors = _errors_of(commands, outcomes)
+        self._errors.append(errors)
         self._picked = bool(outcomes)
-        self._shots += [
-            self._shot(commands, judged, slice(row, row + 1))
-            for row in range(min(len(commands), SHOWN - len(self._shots)))
+        self._samples += [
+            self._sample(commands, errors, slice(row, row + 1))
+            for row in range(min(len(commands), SHOWN - len(self._samples)))
         ]
 
     def files(self) -> Iterator[tuple[str, bytes]]:
@@ -65,41 +72,47 @@ class GraspReport:
         from envs.grasp.evaluation.film import film  # noqa: PLC0415
         from envs.grasp.evaluation.plots import contact_sheet, error_histograms, workspace  # noqa: PLC0415
 
-        settings, judged = self._settings, _concatenate(self._judged)
-        episodes, errors, places, moving = self.file_names
-        yield episodes, contact_sheet(self._shots, goal_middle_m(settings.goal))
-        yield errors, error_histograms(judged, settings.goal)
-        yield places, workspace(judged)
-        yield moving, film(self._shots[:FILMED], settings, self._picked)
+        errors, robot = _concatenate(self._errors), self._arm.robot
+        episodes, histograms, places, moving = self.file_names
+        yield episodes, contact_sheet(self._samples, robot.cup_radius_m)
+        yield histograms, error_histograms(errors)
+        yield places, workspace(errors)
+        yield moving, film(self._samples[:FILMED], self._settings, self._arm, self._picked)
 
-    def _judge(
-        self, commands: PoseCommands, outcomes: Mapping[str, NDArray[np.bool_]]
-    ) -> PoseErrors:
-        target_m, target_yaw_rad = commands.scenes.target_m, commands.scenes.target_yaw_rad
-        offset_m = block_offset(commands.tooltip_m, target_m, target_yaw_rad)
-        names = np.full(len(commands), "", dtype="<U32")
-        for name, rows in outcomes.items():
-            names[rows] = name
-        return PoseErrors(
-            target_m=target_m,
-            target_yaw_deg=np.degrees(target_yaw_rad),
-            error_m=offset_m - commands.region.middle_m,
-            yaw_error_deg=np.degrees(yaw_error(commands.yaw_rad, target_yaw_rad)),
-            outcome=names,
-        )
-
-    def _shot(self, commands: PoseCommands, judged: PoseErrors, row: slice) -> Sample:
+    def _sample(self, commands: PoseCommands, errors: PoseErrors, row: slice) -> Sample:
         return Sample(
             scene=commands.scenes[row],
             view=commands.views[self._camera][row],
             image=commands.images[self._camera][row][0],
             tooltip_m=commands.tooltip_m[row][0],
             yaw_rad=float(commands.yaw_rad[row][0]),
-            judged=PoseErrors(**{name: values[row] for name, values in vars(judged).items()}),
+            errors=errors[row],
         )
 
 
-def _concatenate(parts: list[PoseErrors]) -> PoseErrors:
+def _errors_of(commands: PoseCommands, outcomes: Mapping[str, NDArray[np.bool_]]) -> PoseErrors:
+    target_m, target_yaw_rad = commands.scenes.target_m, commands.scenes.target_yaw_rad
+    offset_m = block_offset(commands.tooltip_m, target_m, target_yaw_rad)
+    names = np.full(len(commands), "", dtype="<U32")
+    for name, rows in outcomes.items():
+        names[rows] = name
     return PoseErrors(
-        **{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
+        target_m=target_m,
+        target_yaw_deg=np.degrees(target_yaw_rad),
+        region=commands.region,
+        error_m=offset_m - commands.region.middle_m,
+        yaw_error_deg=np.degrees(yaw_error(commands.yaw_rad, target_yaw_rad)),
+        outcome=names,
     )
+
+
+def _concatenate(parts: list[PoseErrors]) -> PoseErrors:
+    """All of them, one after the other."""
+    regions = [part.region.arrays() for part in parts]
+    arrays = {
+        name: np.concatenate([vars(part)[name] for part in parts])
+        for name in vars(parts[0])
+        if name != "region"
+    }
+    region = {name: np.concatenate([one[name] for one in regions]) for name in regions[0]}
+    return PoseErrors(region=GoalRegion(**region), **arrays)

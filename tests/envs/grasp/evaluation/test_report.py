@@ -14,13 +14,21 @@ from PIL import Image
 from envs.grasp.env import make_vector_env
 from envs.grasp.evaluation import report as report_module
 from envs.grasp.evaluation.film import film
-from envs.grasp.evaluation.plots import AIM_COLOR, contact_sheet
+from envs.grasp.evaluation.plots import (
+    COMMAND_COLOR,
+    TRUE_COLOR,
+    contact_sheet,
+    error_histograms,
+)
+from envs.grasp.robot.arm import Arm
+from envs.grasp.robot.urdf import load_robot
 from envs.grasp.scene.sampler import heading
 from envs.grasp.sensors.camera import project
 from envs.grasp.settings import Camera, GraspSettings
 from envs.grasp.vector_env import GraspVectorEnv
 
 SHOWN, ENVS = 7, 8
+ARM = Arm.of(GraspSettings(), load_robot())
 
 
 @pytest.fixture(autouse=True)
@@ -38,7 +46,7 @@ def env() -> Iterator[GraspVectorEnv]:
 
 
 def actions(env: GraspVectorEnv, *, ahead: float, up: float, yaw_deg: float) -> np.ndarray:
-    """PoseCommands that far from the grasp points."""
+    """Actions to poses that far from the grasp points."""
     scenes = env.scenes
     tooltip = scenes.target_m + ahead * heading(scenes.target_yaw_rad) + [0.0, 0.0, up]
     return env.action_for(tooltip, scenes.target_yaw_rad + np.radians(yaw_deg))
@@ -52,14 +60,14 @@ def outcomes(*, success: int) -> dict[str, np.ndarray]:
 def test_errors_are_those_to_the_middle_of_the_goal_region(env: GraspVectorEnv) -> None:
     report = env.evaluator().pictures()
     report.add(actions(env, ahead=-0.025, up=0.004, yaw_deg=-3.0), outcomes(success=1))
-    (judged,) = report._judged
+    (errors,) = report._errors
     # The region's gap goes from 10 to 20 mm.
-    np.testing.assert_allclose(judged.error_m, np.tile([0.0, 0.004, 0.01], (ENVS, 1)), atol=1e-9)
-    np.testing.assert_allclose(judged.yaw_error_deg, -3.0)
-    np.testing.assert_allclose(judged.distance_m, np.hypot(0.004, 0.01))
-    assert len(report._shots) == SHOWN
-    assert report._shots[0].caption == "10.8 mm, 3.0 deg   picked"
-    assert report._shots[1].caption == "10.8 mm, 3.0 deg   no seal"
+    np.testing.assert_allclose(errors.error_m, np.tile([0.0, 0.004, 0.01], (ENVS, 1)), atol=1e-9)
+    np.testing.assert_allclose(errors.yaw_error_deg, -3.0)
+    np.testing.assert_allclose(errors.distance_m, np.hypot(0.004, 0.01))
+    assert len(report._samples) == SHOWN
+    assert report._samples[0].caption == "10.8 mm, 3.0 deg   picked"
+    assert report._samples[1].caption == "10.8 mm, 3.0 deg   no seal"
 
 
 @pytest.mark.parametrize("checked", [True, False])
@@ -81,7 +89,7 @@ def test_the_film_goes_on_to_the_pick_only_where_there_is_one(env: GraspVectorEn
     for found in ({}, outcomes(success=ENVS)):
         report = env.evaluator().pictures()
         report.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), found)
-        content = film(report._shots[:1], GraspSettings(), bool(found))
+        content = film(report._samples[:1], GraspSettings(), ARM, bool(found))
         with Image.open(io.BytesIO(content)) as image:
             assert image.info["loop"] == 0
             lengths_ms.append(0)
@@ -98,19 +106,45 @@ def test_the_cup_is_drawn_where_the_camera_would_see_it(
     lines: list[tuple[Any, Any]] = []
     monkeypatch.setattr(
         "matplotlib.axes.Axes.plot",
-        lambda self, u, v, color, **_: lines.append((u, v)) if color == AIM_COLOR else None,
+        lambda self, u, v, color, **_: lines.append((u, v)) if color == COMMAND_COLOR else None,
     )
     report = env.evaluator().pictures()
     report.add(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0), {})
-    shot = report._shots[0]
-    contact_sheet([shot], np.zeros(3))
+    sample = report._samples[0]
+    contact_sheet([sample], 0.03)
     (rim_u, rim_v), (stem_u, stem_v) = lines
-    u, v, depth = project(shot.view, shot.tooltip_m[None, None])[0, 0]
+    u, v, depth = project(sample.view, sample.tooltip_m[None, None])[0, 0]
     assert (stem_u[0], stem_v[0]) == (pytest.approx(u), pytest.approx(v))
     # The rim is round the tooltip, 30 mm away: up and down these are f * 30 mm / depth pixels.
     focal_px = 80 / 2 / np.tan(np.radians(44.0) / 2)
     assert rim_u.min() < u < rim_u.max()
     assert np.ptp(rim_v) == pytest.approx(2 * focal_px * 0.03 / depth, rel=0.1)
+
+
+def test_pictures_show_the_episodes_own_goal_region(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make_vector_env(2, simulator="fast", seed=1)
+    env.set_parameters({"gap_limit_m": 0.05, "lateral_limit_m": 0.03, "yaw_limit_deg": 4.0})
+    env.reset()
+    report = env.evaluator().pictures()
+    report.add(actions(env, ahead=-0.03, up=0.0, yaw_deg=0.0), {})
+    env.close()
+    # In the middle of a gap of 10 to 50 mm the cup at the goal is the commanded one.
+    drawn: dict[str, list[np.ndarray]] = {TRUE_COLOR: [], COMMAND_COLOR: [], "black": []}
+    spans: list[tuple[float, float]] = []
+    monkeypatch.setattr(
+        "matplotlib.axes.Axes.plot",
+        lambda self, u, v, color, **_: drawn[color].append(np.stack([u, v])),
+    )
+    monkeypatch.setattr(
+        "matplotlib.axes.Axes.axvspan", lambda self, low, high, **_: spans.append((low, high))
+    )
+    contact_sheet(report._samples, 0.03)
+    for true, command in zip(drawn[TRUE_COLOR], drawn[COMMAND_COLOR], strict=True):
+        np.testing.assert_allclose(true, command, atol=1e-6)
+    (errors,) = report._errors
+    error_histograms(errors)
+    expected = [(-limit, limit) for limit in (30.0, 10.0, 20.0, 4.0)]
+    np.testing.assert_allclose(spans, expected)
 
 
 def test_an_rgb_camera_alone_will_do() -> None:
