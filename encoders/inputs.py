@@ -62,10 +62,10 @@ class DepthInput(ImageInput):
     def scale(self, raw: torch.Tensor) -> torch.Tensor:
         """Raw depths to [0, 1] over the camera's range, and where they are depths."""
         min_m, max_m = self.space.range_m
-        scaled = self.space.decode(raw).sub_(min_m).mul_(1.0 / (max_m - min_m))
-        if self.validity_channel:
-            return torch.cat([scaled, self.space.seen(raw).float()], dim=-1)
-        return scaled
+        metres = self.space.decode_seen(raw)
+        seen = metres.isfinite().float() if self.validity_channel else None
+        scaled = metres.clamp_(max=max_m).sub_(min_m).mul_(1.0 / (max_m - min_m))
+        return scaled if seen is None else torch.cat([scaled, seen], dim=-1)
 
 
 class ByteInput(ImageInput):

@@ -96,7 +96,7 @@ class DepthImage(Box):
             )
 
     def encode(self, metres: NDArray[np.floating]) -> NDArray[np.integer]:
-        """Encodes depths as the camera would.
+        """Encodes depths as the camera would; `envs.grasp.sensors.depth.sense` must agree.
 
         Args:
             metres: Depths in metres, (..., height, width); infinite where nothing was hit.
@@ -125,13 +125,14 @@ class DepthImage(Box):
 
     def decode_seen(self, raw: torch.Tensor) -> torch.Tensor:
         """As `decode`, but infinite where nothing was seen."""
+        import torch  # noqa: PLC0415
         from torch.nn.functional import threshold  # noqa: PLC0415
 
         first, last = self.codes
         # torch has next to no arithmetic on uint16, so leave it first. What follows is in place: a
         # copy of all pixels for each operation would cost more than the operations. A threshold
         # takes a quarter of the time of a comparison and a masked fill.
-        metres = threshold(raw.float(), first - 0.5, math.inf, inplace=True)
+        metres = threshold(raw.to(torch.float32, copy=True), first - 0.5, math.inf, inplace=True)
         if self.encoding == "uint16":  # whose codes go on beyond the last
             threshold(metres.neg_(), -last - 0.5, -math.inf, inplace=True).neg_()
         metres.div_(self.codes_per_m)

@@ -120,6 +120,14 @@ def test_encode_rounds_and_gives_0_to_what_is_outside_the_range():
     assert uint8.ravel().tolist() == [0, 1, 1, 16, 255, 0, 0]
 
 
+@pytest.mark.parametrize("method", ["decode", "decode_seen", "seen"])
+def test_decoding_leaves_its_argument_alone(method):
+    space = DepthImage(1, 3)
+    raw = torch.tensor([0.0, 1000.0, 3000.0])
+    getattr(space, method)(raw)
+    assert raw.tolist() == [0.0, 1000.0, 3000.0]
+
+
 def test_encode_leaves_its_argument_alone():
     metres = np.array([[0.1, 1.0]])
     DepthImage(1, 2).encode(metres)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from encoders.spaces import NOTHING_SEEN, DepthImage
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.sensors.noise import FAST, fill_normals, fill_uniforms
+from envs.grasp.settings import MAX_NOISE_SIGMA_M
 from envs.grasp.simulators.kernels.worlds import kernel
 
 Floats = NDArray[np.float64]
@@ -53,12 +54,15 @@ def sensor_of(views: CameraPoses, space: DepthImage, seeds: NDArray[np.uint64]) 
         seeds: (n,) of the pictures.
 
     Raises:
-        ValueError: a camera's noise or share of missing pixels is not finite, or not of shape (n,).
+        ValueError: a camera's noise or share of missing pixels is not of shape (n,), or not within
+            what the settings allow.
     """
-    for name in ("noise_sigma_m", "missing_fraction"):
-        values = getattr(views, name)
-        if np.shape(values) != np.shape(seeds) or not np.isfinite(values).all():
-            raise ValueError(f"{name} must be finite, one for each of {len(seeds)} pictures")
+    for name, most in (("noise_sigma_m", MAX_NOISE_SIGMA_M), ("missing_fraction", 1.0)):
+        values = np.asarray(getattr(views, name))
+        if values.shape != np.shape(seeds) or not ((values >= 0.0) & (values <= most)).all():
+            raise ValueError(
+                f"{name} must be within 0 and {most:g}, one for each of {len(seeds)} pictures"
+            )
     return Sensor(
         np.ascontiguousarray(seeds, np.uint64),
         np.ascontiguousarray(views.noise_sigma_m, np.float64),
@@ -112,7 +116,7 @@ def sense(
     uniforms: Pixels,
     codes: Codes,
 ) -> None:
-    """Writes the codes (P,) of one picture.
+    """Writes the codes (P,) of one picture; without noise, those of `DepthImage.encode`.
 
     Args:
         true: (P,) true depth in metres, infinite where nothing is hit; or one over it.

@@ -740,3 +740,14 @@ def test_privileged_numbers_are_not_offered_unasked(make: MakeEnv) -> None:
     env = make(1)
     assert set(env.single_observation_space.spaces) == {"depth"}
     assert set(env.reset(seed=0)[0]) == {"depth"}
+
+
+def test_privileged_numbers_may_leave_out_the_goals_limits(make: MakeEnv) -> None:
+    whole, without = make(3, privileged=True), make(3, privileged=True, privileged_limits=False)
+    assert without.single_observation_space["privileged"].shape == (18,)
+    for env in (whole, without):
+        env.set_parameters({"lateral_limit_m": 0.1})
+    actions = np.full((3, 4), 0.2)
+    for method, given in (("reset", {"seed": 0}), ("step", {"actions": actions})):
+        seen = [getattr(env, method)(**given)[0]["privileged"] for env in (whole, without)]
+        np.testing.assert_array_equal(seen[1], np.delete(seen[0], np.s_[13:17], axis=1))

@@ -10,7 +10,7 @@ from worlds import fixed_views, home, sampled
 from encoders.spaces import DepthImage
 from envs.grasp.robot.urdf import load_robot
 from envs.grasp.sensors.camera import CameraPoses
-from envs.grasp.sensors.depth import sense_depth
+from envs.grasp.sensors.depth import sense_depth, sensor_of
 from envs.grasp.sensors.noise import fill_uniforms
 from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.fast import FastSimulator
@@ -179,5 +179,22 @@ def test_shares_of_missing_pixels_are_probabilities(share: tuple[float, float]) 
 def test_a_sensor_that_makes_no_sense_is_refused() -> None:
     space, seeds = DepthImage(200, 300), np.array([1], np.uint64)
     for views in (cameras([np.nan]), cameras([0.0], [np.inf]), cameras([0.0, 0.0])):
-        with pytest.raises(ValueError, match="must be finite, one for each of 1 pictures"):
+        with pytest.raises(ValueError, match="must be within 0 and 1, one for each of 1 pictures"):
             sense_depth(FLAT, views, space, seeds)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("noise_sigma_m", -0.001),
+        ("noise_sigma_m", np.inf),
+        ("missing_fraction", -0.1),
+        ("missing_fraction", 1.1),
+        ("missing_fraction", np.nan),
+    ],
+)
+def test_a_sigma_under_0_and_a_share_that_is_none_are_refused(name: str, value: float) -> None:
+    poses = fixed_views(Camera(type="depth", width=4, height=3), 2)
+    wrong = poses.with_arrays({name: np.array([0.0, value])})
+    with pytest.raises(ValueError, match=f"{name} must be within 0 and 1"):
+        sensor_of(wrong, DepthImage(3, 4), np.zeros(2, np.uint64))
