@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.robot.arm import Arm
 from envs.grasp.robot.kinematics import InverseKinematics, tooltip_pose
-from envs.grasp.robot.paths import duration_s, path_poses
+from envs.grasp.robot.paths import Path, leg_speeds, legs, path_poses, straight_leg
 from envs.grasp.scene.sampler import Scenes, to_world
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Pick, Support
@@ -216,13 +216,13 @@ class Attempt:
         No joint is faster than it can, and the tool comes to rest at the stand-off.
         """
         home = self._arm.home(1)
-        tools, path, _ = self._arm.reach(home, tooltip_m[None], np.array([yaw_rad]))
+        tools, _, _ = self._arm.reach(home, tooltip_m[None], np.array([yaw_rad]))
         ahead = tools.approach_rad[0]
-        transit = path[0, len(ahead) - 1 :][:3]  # from home there is nothing to retreat from
-        transit_s = SMOOTH_PEAK * float(duration_s(self._kinematics, transit))
-        touch = self._follow(path_poses(transit, _smooth(transit_s)))
-        if touch is Touch.NOTHING:
-            touch = self._follow(path_poses(ahead, _smooth(self._settings.approach_s)))
+        # From home there is nothing to retreat from.
+        transit = straight_leg(self._joints_rad, ahead[0])
+        touch = self._drive(transit, 0.0)
+        if touch is Touch.NOTHING and (ahead != ahead[0]).any():
+            touch = self._drive(ahead, self._settings.approach_s)
         return touch
 
     def advance(self) -> Touch:
@@ -233,7 +233,7 @@ class Attempt:
         settings, pose = self._settings, tooltip_pose(self._kinematics, self._joints_rad)
         steps = math.ceil(settings.advance_m / (settings.advance_speed_m_s * STEP_S))
         way_m = np.linspace(0.0, settings.advance_m, steps + 1)[1:]
-        return self._follow(self._straight(pose, way_m, pose[:3, 2])[0])
+        return self._follow(self._straight(pose, way_m, pose[:3, 2]))
 
     def seals(self) -> bool:
         """Whether all of the cup's rim is on the target's face, to within a lip's give."""
@@ -256,7 +256,7 @@ class Attempt:
         held = np.full(round(settings.hold_s / STEP_S), settings.lift_m)
         suction, point = self._suck()
         pose = tooltip_pose(self._kinematics, self._joints_rad)
-        path, _ = self._straight(pose, np.concatenate([up, held]), np.array([0.0, 0.0, 1.0]))
+        path = self._straight(pose, np.concatenate([up, held]), np.array([0.0, 0.0, 1.0]))
         for joints_rad in path:
             self._step(joints_rad)
             grasped, _ = pybullet.multiplyTransforms(*self.target_pose(), point, UPRIGHT)
@@ -289,16 +289,25 @@ class Attempt:
         put(self._id, body, place_m.tolist(), turned(float(yaw_rad)))
         return body
 
-    def _straight(
-        self, pose: Floats, way_m: Floats, direction: Floats
-    ) -> tuple[Floats, NDArray[np.bool_]]:
+    def _straight(self, pose: Floats, way_m: Floats, direction: Floats) -> Floats:
         """Joints (k, 6) that move the tool by ways (k,) along a direction (3,) from a pose (4, 4).
 
-        Returns them, and whether they lead there (k,).
+        Where a way leads out of reach they are those that come nearest.
         """
         poses = np.tile(pose, (len(way_m), 1, 1))
         poses[:, :3, 3] += way_m[:, None] * direction
-        return self._inverse.of_pose(poses)
+        joints_rad, _ = self._inverse.of_pose(poses)
+        return np.asarray(joints_rad)
+
+    def _drive(self, path: Path, least_s: float) -> Touch:
+        """Drives along a path (2 k + 1, 6), from rest to rest, until something is touched.
+
+        It takes `least_s`, or as long as the slowest joint needs in the middle of it.
+        """
+        # A path's parts pass evenly: each leg, whatever its length, takes its share of the time.
+        speeds = np.array([leg_speeds(leg) for leg in legs(path)]) * len(legs(path))
+        needed_s = SMOOTH_PEAK * float(np.max(speeds / self._kinematics.max_speed_rad_s))
+        return self._follow(path_poses(path, _smooth(max(needed_s, least_s))))
 
     def _follow(self, path_rad: Iterable[Floats]) -> Touch:
         """Drives along joints (6,), one after each time step, until something is touched."""

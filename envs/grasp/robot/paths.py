@@ -53,8 +53,10 @@ def path_poses(path: Path, part: Floats) -> Floats:
     along = legs(path)
     place = np.asarray(part) * len(along)
     number = np.minimum(place.astype(int), len(along) - 1)
-    poses = [leg_poses(along[leg], place[number == leg] - leg) for leg in range(len(along))]
-    return np.concatenate(poses)
+    poses = np.empty((len(place), path.shape[-1]))
+    for leg in range(len(along)):
+        poses[number == leg] = leg_poses(along[leg], place[number == leg] - leg)
+    return poses
 
 
 def leg_speeds(leg: Floats) -> Floats:

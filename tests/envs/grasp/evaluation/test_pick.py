@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 from envs.grasp.env import make_vector_env
-from envs.grasp.evaluation.pick import Attempt, Outcome, Picker
+from envs.grasp.evaluation.pick import STEP_S, Attempt, Outcome, Picker
 from envs.grasp.robot.arm import Arm
+from envs.grasp.robot.kinematics import tooltip_pose
 from envs.grasp.robot.urdf import load_robot
 from envs.grasp.scene.sampler import Scenes, SceneSampler, heading
 from envs.grasp.settings import GraspSettings, Pick, Randomize, Support
 
 BuildScene = Callable[..., Scenes]
 GAP_M = 0.015
+FREE_M = np.array([1.0, -0.35, 0.85])
 ARM = Arm.of(GraspSettings(), load_robot())
 BOX = ((1.0, 0.0), 0.0, (0.1, 0.16, 0.2))
 
@@ -175,3 +177,32 @@ def test_the_environment_picks_without_its_episodes_noticing(simulator: str) -> 
         np.testing.assert_equal(env.state_dict(), before)
     finally:
         env.close()
+
+
+def commanded(arm: Arm, settings: Pick, scene: Scenes) -> np.ndarray:
+    """Joints (n, 6) that the motors were sent to at each time step, on the way to a free pose."""
+    joints, picker = [arm.robot.home_rad], Picker(arm, Support(), settings)
+    picker.reach(scene, FREE_M, 0.3, lambda attempt: joints.append(attempt._joints_rad))
+    picker.close()
+    return np.array(joints)
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"standoff_m": 0.15}, {"motion": "direct"}], ids=["default", "long", "direct"]
+)
+@pytest.mark.parametrize("approach_s", [0.01, 0.5])
+def test_no_joint_is_sent_faster_than_it_can(
+    box_scene: BuildScene, options: dict[str, Any], approach_s: float
+) -> None:
+    arm = Arm.of(GraspSettings(**options), load_robot())
+    joints = commanded(arm, Pick(approach_s=approach_s), box_scene([BOX]))
+    turned = np.abs(np.diff(joints, axis=0))
+    assert (turned / STEP_S <= arm.robot.max_speed_rad_s * (1.0 + 1e-9)).all()
+    assert (turned > 0.0).any(axis=1).all()  # nor does it stand still
+    pose = tooltip_pose(arm.robot, joints[-1])
+    np.testing.assert_allclose(pose[:3, 3], FREE_M, atol=1e-9)
+
+
+def test_a_slow_approach_takes_its_time(box_scene: BuildScene) -> None:
+    lengths = [len(commanded(ARM, Pick(approach_s=s), box_scene([BOX]))) for s in (1.0, 2.0)]
+    assert lengths[1] - lengths[0] == round(1.0 / STEP_S)

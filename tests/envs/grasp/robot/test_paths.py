@@ -39,6 +39,12 @@ def test_no_joint_is_faster_than_its_bound(start: float, middle: float, end: flo
     assert fastest >= 0.98 * leg_speeds(leg)[0] - 1e-9
 
 
+def test_poses_of_a_path_come_in_the_order_that_they_are_asked_for() -> None:
+    path = np.array([[0.0], [0.5], [1.0], [2.0], [3.0]])  # legs of 1 and of 2
+    part = np.array([1.0, 0.25, 0.75, 0.0, 0.5])
+    np.testing.assert_allclose(path_poses(path, part)[:, 0], [3.0, 0.5, 2.0, 0.0, 1.0])
+
+
 def test_paths_are_joined_at_their_ends() -> None:
     start, end = np.zeros((2, 6)), np.ones((2, 6))
     path = joined(straight_leg(start, end), straight_leg(end, start))
