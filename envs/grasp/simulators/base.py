@@ -75,8 +75,8 @@ class Simulator(Protocol):
         Args:
             indices: the worlds (n,).
             views: the depth cameras, with their noise.
-            space: clamps and encodes.
-            seeds: (n,) of each picture's noise, which depends on nothing else.
+            space: the range, and how it is encoded.
+            seeds: (n,) of all that is random in each picture.
 
         Returns:
             (n, H, W, 1) in the space's type.

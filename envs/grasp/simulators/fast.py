@@ -283,7 +283,7 @@ def _room(worlds: WorldArrays, indices: Indices) -> tuple[Floats, Floats]:
 
 
 def _view_arrays(views: CameraPoses, n: int) -> ViewArrays:
-    """CameraPoses as the kernels take them; there must be n, all possible ones."""
+    """Camera poses as the kernels take them; there must be n, all possible ones."""
     _check(views.position_m, (n, 3), "position_m of the views")
     _check(views.rotation, (n, 3, 3), "rotation of the views")
     _check(views.near_m, (n,), "near_m of the views")

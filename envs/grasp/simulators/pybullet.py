@@ -40,7 +40,8 @@ CLIENTS_PER_PROCESS = 8
 # PyBullet keeps some 10 kB of every removed body until its whole simulation is reset.
 LOADS_BEFORE_RESET = 400
 PARKED_M = [0.0, 0.0, -1000.0]
-WINDOW_POSE_S = 0.04
+# Of the window: how long a pose is shown, and how far the robot moves, at most, to the next.
+WINDOW_POSE_S, WINDOW_POSE_M = 0.04, 0.02
 # Distances are asked for up to this: PyBullet takes longer the more it has to measure.
 SIGHT_M = 0.1
 
@@ -144,7 +145,7 @@ class _Client:
     def __init__(self, robot: Robot, support: Support, window: bool):
         self._kinematics, self._support = robot, support
         self._reach_m = np.max(shape_reach(robot), axis=0)
-        self._pause_s = WINDOW_POSE_S if window else 0.0
+        self._window = window
         self._id = open_client(window)
         self._worlds: dict[int, _World] = {}
         self._active: int | None = None
@@ -179,6 +180,8 @@ class _Client:
                 clear_m = self._look(self._worlds[slot], joints_rad, found)
                 part += max(clear_m, resolution_m) / way_m
         self._look(self._worlds[slot], path_rad[-1], found)
+        if self._window:
+            self._show(path_rad)
         self._worlds[slot].joints_rad = path_rad[-1]
         return found.touched, found.collided
 
@@ -221,6 +224,14 @@ class _Client:
         set_joints(self._id, self._robot, world.joints_rad)
         self._active = slot
 
+    def _show(self, path_rad: Path) -> None:
+        """Moves along a path (2 k + 1, 6) at a pace to be watched."""
+        for leg in legs(path_rad):
+            poses = math.ceil(float(leg_speeds(leg) @ self._reach_m) / WINDOW_POSE_M)
+            for joints_rad in leg_poses(leg, np.linspace(0.0, 1.0, poses + 1)[1:]):
+                set_joints(self._id, self._robot, joints_rad)
+                time.sleep(WINDOW_POSE_S)
+
     def _look(self, world: _World, joints_rad: Floats, found: _Found) -> float:
         """Puts the robot somewhere, and adds what it touches there to what was found.
 
@@ -228,8 +239,6 @@ class _Client:
             The distance in metres to what it does not touch yet, `SIGHT_M` at most.
         """
         set_joints(self._id, self._robot, joints_rad)
-        if self._pause_s:
-            time.sleep(self._pause_s)
         clear_m = SIGHT_M
         for number, body in enumerate((*world.blocks, self._table)):
             for point in pybullet.getClosestPoints(

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -464,3 +465,29 @@ def test_a_window_without_a_display_is_an_error_and_not_the_end(display: str | N
     if display and "libX11" not in done.stdout:
         assert f"DISPLAY={display}" in done.stdout
         assert "rgb_array" in done.stdout
+
+
+def test_a_window_shows_motions_at_the_same_pace_whatever_is_near(
+    simulate: Callable[..., PyBulletSimulator],
+    box_scene: SceneBuilder,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sleeps: list[float] = []
+    monkeypatch.setattr(time, "sleep", sleeps.append)
+    path = straight_leg(pose(1.1, -0.3, 0.8)[:, 0], pose(1.1, 0.3, 0.8)[:, 0])
+    counts = []
+    for x in (1.1, 1.4):
+        simulator = simulate(box_scene([((x, 0.0), 0.0, (0.1, 0.1, 0.15))]))
+        (client,) = simulator._clients
+        simulator.move(FIRST, path, RESOLUTION_M)
+        assert not sleeps
+        client._window = True
+        simulator.move(FIRST, path, RESOLUTION_M)
+        counts.append(len(sleeps))
+        joints = [
+            pybullet.getJointState(client._robot.body, joint, client._id)[0]
+            for joint in client._robot.joints
+        ]
+        np.testing.assert_allclose(joints, path[0, -1])
+        sleeps.clear()
+    assert counts[0] == counts[1] > 10
