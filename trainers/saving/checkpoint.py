@@ -60,6 +60,7 @@ class Loaded:
             for.
         path: the checkpoint's folder.
         score: what it was saved with, higher is better.
+        score_of: what that measures; empty where it was saved before this was said.
         notes: for the user: which checkpoints were passed over before this one, and why.
     """
 
@@ -68,6 +69,7 @@ class Loaded:
     state: Any
     path: Path
     score: float | None
+    score_of: str
     notes: list[str] = field(default_factory=list)
 
 
@@ -79,6 +81,7 @@ class CheckpointInfo:
         step: environment steps taken when it was saved.
         path: its folder.
         score: higher is better; None where it was saved without one.
+        score_of: what that measures; empty where it was saved before this was said.
         serial: the order in which the checkpoints were saved, which is not always that of the
             steps: a run that went back to an earlier checkpoint goes on from there. None where
             the manifest can't be read.
@@ -87,6 +90,7 @@ class CheckpointInfo:
     step: int
     path: Path
     score: float | None
+    score_of: str
     serial: int | None
 
 
@@ -100,6 +104,7 @@ class _Manifest(BaseModel, frozen=True):
     step: int
     serial: int
     score: float | None
+    score_of: str = ""
     files: dict[str, _FileRecord]
 
 
@@ -129,7 +134,12 @@ class Checkpoints:
         self.keep = keep
 
     def save(
-        self, step: int, weights: Mapping[str, torch.Tensor], state: Any, score: float | None
+        self,
+        step: int,
+        weights: Mapping[str, torch.Tensor],
+        state: Any,
+        score: float | None,
+        score_of: str = "",
     ) -> Path:
         """Save a checkpoint, mark it, and remove those no longer needed.
 
@@ -141,6 +151,8 @@ class Checkpoints:
             weights: tensors by name; all that evaluation needs.
             state: nested state as `trainers.saving.serialization.flatten` takes it.
             score: higher is better; None (or NaN) where there is none yet.
+            score_of: what it measures, also where there is none yet; only scores of the same are
+                compared.
 
         Returns:
             The checkpoint's folder, `step-<step>`.
@@ -160,7 +172,7 @@ class Checkpoints:
                 _write_weights(temporary / WEIGHTS, weights)
                 _write_safetensors(temporary / STATE_ARRAYS, arrays)
                 (temporary / STATE).write_text(json.dumps(skeleton, allow_nan=False))
-                self._write_manifest(temporary, step, score)
+                self._write_manifest(temporary, step, score, score_of)
                 _move_into_place(temporary, path)
             except BaseException:
                 shutil.rmtree(temporary, ignore_errors=True)
@@ -193,7 +205,8 @@ class Checkpoints:
     def load_best(self, *, with_state: bool = True) -> Loaded:
         """Load the checkpoint with the highest score (the later one where two are equal).
 
-        Falls back as `load_latest` does. Checkpoints without a score come last, newest first.
+        Falls back as `load_latest` does. Checkpoints without a score, or with one of something else
+        than the newest checkpoint's, come last, newest first.
 
         Args:
             with_state: False for the weights alone: nothing else is read or checked.
@@ -201,7 +214,7 @@ class Checkpoints:
         Raises:
             CheckpointError: there is none that can be used.
         """
-        return self._load_first(sorted(self._entries(), key=_merit_order, reverse=True), with_state)
+        return self._load_first(_by_merit(self._entries()), with_state)
 
     @staticmethod
     def load(path: Path, *, with_state: bool = True) -> Loaded:
@@ -268,7 +281,7 @@ class Checkpoints:
             else:
                 shutil.rmtree(path)
 
-    def _write_manifest(self, folder: Path, step: int, score: float | None) -> None:
+    def _write_manifest(self, folder: Path, step: int, score: float | None, score_of: str) -> None:
         """Describe the folder's files in its manifest and put everything on the disk."""
         serials = [entry.serial for entry in self._entries() if entry.serial is not None]
         manifest = _Manifest(
@@ -276,6 +289,7 @@ class Checkpoints:
             step=step,
             serial=max(serials, default=0) + 1,
             score=None if score is None or not math.isfinite(score) else float(score),
+            score_of=score_of,
             files={
                 name: _FileRecord(
                     size=(folder / name).stat().st_size, sha256=_digest(folder / name)
@@ -290,7 +304,7 @@ class Checkpoints:
 
     def _mark_and_prune(self) -> None:
         whole = sorted((e for e in self._entries() if _has_right_sizes(e.path)), key=_age_order)
-        best = max(whole, key=_merit_order)
+        best = _by_merit(whole)[0]
         # Markers first: they must never name a folder that is gone.
         self._mark("latest", whole[-1])
         self._mark("best", best)
@@ -315,6 +329,7 @@ def weights_manifest(checkpoint: Loaded, weights: bytes) -> str:
         step=checkpoint.step,
         serial=1,
         score=checkpoint.score,
+        score_of=checkpoint.score_of,
         files={WEIGHTS: record},
     ).model_dump_json(indent=2)
 
@@ -324,8 +339,17 @@ def _age_order(entry: CheckpointInfo) -> tuple[float, int]:
     return (math.inf if entry.serial is None else entry.serial, entry.step)
 
 
-def _merit_order(entry: CheckpointInfo) -> tuple[float, tuple[float, int]]:
-    return (-math.inf if entry.score is None else entry.score, _age_order(entry))
+def _by_merit(entries: list[CheckpointInfo]) -> list[CheckpointInfo]:
+    """The best first; scores are compared that are of the same as the newest checkpoint's."""
+    newest_first = sorted(entries, key=_age_order, reverse=True)
+    score_of = next((entry.score_of for entry in newest_first if entry.serial is not None), "")
+
+    def merit(entry: CheckpointInfo) -> float:
+        if entry.score is None or entry.score_of != score_of:
+            return -math.inf
+        return entry.score
+
+    return sorted(newest_first, key=merit, reverse=True)
 
 
 def _write_weights(path: Path, weights: Mapping[str, torch.Tensor]) -> None:
@@ -366,8 +390,8 @@ def _info(step: int, path: Path) -> CheckpointInfo:
     try:
         manifest = _read_manifest(path)
     except _DamageError:
-        return CheckpointInfo(step, path, score=None, serial=None)
-    return CheckpointInfo(step, path, manifest.score, manifest.serial)
+        return CheckpointInfo(step, path, score=None, score_of="", serial=None)
+    return CheckpointInfo(step, path, manifest.score, manifest.score_of, manifest.serial)
 
 
 def _has_right_sizes(path: Path) -> bool:
@@ -393,7 +417,7 @@ def _read(path: Path, with_state: bool) -> Loaded:
             state = unflatten(skeleton, safetensors.numpy.load_file(path / STATE_ARRAYS))
     except (OSError, ValueError, KeyError, safetensors.SafetensorError) as error:
         raise _DamageError(f"its content can't be read: {error}") from error
-    return Loaded(manifest.step, weights, state, path, manifest.score)
+    return Loaded(manifest.step, weights, state, path, manifest.score, manifest.score_of)
 
 
 def _read_manifest(path: Path) -> _Manifest:

@@ -18,10 +18,12 @@ from trainers.saving.checkpoint import CheckpointError, Checkpoints
 FILES = ["weights.safetensors", "state.safetensors", "state.json", "manifest.json"]
 
 
-def save(checkpoints: Checkpoints, step: int, score: float | None = None) -> Path:
+def save(
+    checkpoints: Checkpoints, step: int, score: float | None = None, score_of: str = "reward"
+) -> Path:
     weights = {"w": torch.full((2, 3), float(step)), "n": torch.tensor(step)}
     state = {"step": step, "rng": np.arange(5, dtype=np.uint64), "adam": {0: torch.ones(2)}}
-    return checkpoints.save(step, weights, state, score)
+    return checkpoints.save(step, weights, state, score, score_of)
 
 
 def names(directory: Path) -> list[str]:
@@ -198,6 +200,31 @@ def test_a_better_one_takes_the_place_of_the_best(tmp_path: Path) -> None:
     for step, score in [(100, 0.5), (200, 0.4), (300, 0.6), (400, 0.6), (500, 0.1)]:
         save(checkpoints, step, score)
     assert steps(checkpoints) == [400, 500]  # of two equal ones, the later
+
+
+def test_scores_of_something_else_than_the_newests_are_not_compared(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path, keep=9)
+    save(checkpoints, 100, score=18.5, score_of="")  # before it was said of what
+    assert marked(tmp_path, "best") == "step-100"
+    save(checkpoints, 200, score=0.4, score_of="evaluation.success")
+    assert marked(tmp_path, "best") == "step-200"
+    save(checkpoints, 300, score=0.3, score_of="evaluation.success")
+    save(checkpoints, 400, score_of="evaluation.success")  # between two evaluations
+    assert marked(tmp_path, "best") == "step-200"
+    assert checkpoints.load_best().score_of == "evaluation.success"
+    save(checkpoints, 500, score_of="age")  # nothing compares: the newest
+    assert marked(tmp_path, "best") == "step-500"
+
+
+def test_a_manifest_need_not_say_what_its_score_is_of(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path, keep=9)
+    for step, score in ((100, 0.7), (200, 0.6)):
+        path = save(checkpoints, step, score) / "manifest.json"
+        manifest = json.loads(path.read_text())
+        assert manifest.pop("score_of") == "reward"
+        path.write_text(json.dumps(manifest))
+    assert checkpoints.load_best().step == 100
+    assert checkpoints.load_best().score_of == ""
 
 
 def test_without_a_score_none_is_best_unless_there_is_nothing_else(tmp_path: Path) -> None:
