@@ -32,7 +32,7 @@ from trainers.algorithms.ddpg import DDPGSettings
 from trainers.algorithms.ppo import PPOSettings
 from trainers.algorithms.trpo import TRPOSettings
 from trainers.common.errors import UserError
-from trainers.evaluation import FIRST_SEED, final_parameters
+from trainers.evaluation import FIRST_SEED
 from trainers.networks.actions import to_environment
 from trainers.networks.actor_critic import ActorCritic
 from trainers.networks.deterministic import DeterministicActorCritic
@@ -40,7 +40,7 @@ from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import to_tensors
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import RunSettings, load_run
-from trainers.session import build_environment, build_factory, set_parameters
+from trainers.session import build_environment, build_factory, final_parameters
 
 Policy = ActorCritic | DeterministicActorCritic
 
@@ -178,7 +178,7 @@ def _environment(run: RunSettings, seed: int) -> GraspVectorEnv:
             "environment.type: only the grasp task knows the right actions; fit a run file with "
             "`environment: {type: grasp}`"
         )
-    set_parameters(env, final_parameters(run))
+    env.set_parameters(final_parameters(run))
     return env
 
 

@@ -6,22 +6,24 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from envs.environment import EnvironmentFailure
 from envs.evaluation import EvaluationOption, Figure, RunFileOption
 from trainers.common.errors import UserError, suggestion
 from trainers.common.files import write_atomically
-from trainers.evaluation import Evaluation, evaluate, find_run
-from trainers.learn import DONE, MISTAKE
+from trainers.evaluation import SEED_LIMIT, Evaluation, evaluate, find_run
+from trainers.experience.env_runner import NonFiniteError
+from trainers.learn import DONE, FAILED, MISTAKE
+from trainers.reporting.figures import figure_values
 from trainers.runfile.settings import Component
 
 PROGRAM = "python -m trainers.evaluate"
-HEADER = ("episodes", "seed")
-"""Entries of a report that are the table's title."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,6 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as mistake:
         print(f"error: {mistake}", file=sys.stderr)
         return MISTAKE
+    except (NonFiniteError, EnvironmentFailure) as failure:
+        print(f"error: {failure}", file=sys.stderr)
+        return FAILED
     Console().print(table(options.policy, evaluation))
     return DONE
 
@@ -60,7 +65,10 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     generic = _generic_options()
     known, rest = generic.parse_known_args(arguments)
     policy = next((word for word in rest if not word.startswith("-")), None)
-    environment = None if policy is None else _environment(policy, known.results_dir)
+    environment = None
+    if policy is not None:
+        with _policy_first(rest[0]):
+            environment = _environment(policy, known.results_dir)
     offered = () if environment is None else environment.cls.evaluation_options
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
@@ -89,7 +97,7 @@ def _generic_options() -> argparse.ArgumentParser:
         prog=PROGRAM, usage=f"{PROGRAM} POLICY [KEY=VALUE ...] [options]", add_help=False
     )
     parser.add_argument("--episodes", type=_positive, help="how many (default: the environment's)")
-    parser.add_argument("--seed", type=_not_negative, default=0, help="of the episodes")
+    parser.add_argument("--seed", type=_seed, default=0, help="of the episodes")
     parser.add_argument(
         "--render",
         nargs="?",
@@ -104,8 +112,22 @@ def _generic_options() -> argparse.ArgumentParser:
     return parser
 
 
+@contextmanager
+def _policy_first(word: str) -> Iterator[None]:
+    """Says what may be wrong where an option of the environment stands before the policy.
+
+    Its value was taken for the policy then: which options have one is known from the policy.
+    """
+    try:
+        yield
+    except UserError as error:
+        if not word.startswith("-"):
+            raise
+        raise UserError(f"{error}; the policy comes before {word}") from error
+
+
 def _environment(policy: str, results_dir: Path) -> Component:
-    run, *_ = find_run(policy, (), results_dir)
+    _, run = find_run(policy, (), results_dir)
     return run.environment
 
 
@@ -162,21 +184,11 @@ def table(name: str, evaluation: Evaluation) -> Table:
     result.add_column("figure")
     result.add_column("value", justify="right")
     result.add_column("better")
-    for key, value in report.items():
-        if key in HEADER:
-            continue
-        plain = Figure(key, key.replace("_", " "), better=None)
-        for row in _rows(evaluation.figures.get(key, plain), value):
-            result.add_row(*row)
-    return result
-
-
-def _rows(figure: Figure, value: float | dict[str, float]) -> Iterator[tuple[str, str, str]]:
-    """A report's entry, or its parts: what it is called, the value, and which way is better."""
-    parts = value.items() if isinstance(value, dict) else [("", value)]
-    for part, number in parts:
+    for key, part, value in figure_values(report):
+        figure = evaluation.figures.get(key, Figure(key, key.replace("_", " "), better=None))
         label = f"{figure.label}, {part}".replace("_", " ") if part else figure.label
-        yield label, figure.shown(number), figure.better or ""
+        result.add_row(label, figure.shown(value), figure.better or "")
+    return result
 
 
 def _write(path: Path, report: dict[str, Any]) -> None:
@@ -193,10 +205,10 @@ def _positive(text: str) -> int:
     return value
 
 
-def _not_negative(text: str) -> int:
+def _seed(text: str) -> int:
     value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{value} is negative")
+    if not 0 <= value < SEED_LIMIT:
+        raise argparse.ArgumentTypeError(f"{value} is not from 0 to {SEED_LIMIT - 1}")
     return value
 
 

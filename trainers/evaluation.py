@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from curricula.samplers import ParameterValue
 from envs.environment import Environment
 from envs.evaluation import EvaluationReport, Figure, PhysicalCheck
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import EpisodeBatch, concatenate
-from trainers.inference.policy import Policy, load_weights
-from trainers.networks.policy_network import PolicyNetwork
+from trainers.inference.policy import Policy
 from trainers.reporting.figures import (
     Metrics,
     check_report,
@@ -27,20 +25,18 @@ from trainers.reporting.figures import (
     report_figures,
     summaries,
 )
-from trainers.runfile.registry import Registries, load_registries
+from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import RunSettings, load_run
-from trainers.saving.checkpoint import Loaded
 from trainers.saving.evaluation_folder import EVALUATION, EvaluationFolder
-from trainers.saving.run_folder import CONFIGURATION, find_checkpoint, run_folder
-from trainers.session import (
-    build_curriculum,
-    build_environment,
-    build_factory,
-    set_parameters,
-)
+from trainers.saving.run_folder import CONFIGURATION, find_run_folder
+from trainers.session import blaming_parameters, build_environment, final_parameters
 
 # Run files take seeds below this, so that no run was ever trained on an evaluation's episodes.
 FIRST_SEED = 2**32
+SEED_LIMIT = 2**31
+"""Seeds of evaluations are below it: each has two of the numbers from `FIRST_SEED` on."""
+SEEDS_PER_BATCH = 2 * FIRST_SEED
+"""From one batch of first actions to the next; runs and other evaluations have none of them."""
 FIRST_ACTION, WHOLE_EPISODE = 0, 1
 
 
@@ -91,8 +87,9 @@ def evaluate(
     Args:
         policy: a run's folder or id, or a checkpoint's folder.
         episodes: see `evaluate_policy`; None: what the environment is judged by.
-        seed: of the episodes, which no training run has seen.
-        overrides: `KEY=VALUE`s on top of the run's own configuration.
+        seed: of the episodes, which no training run has seen; below `SEED_LIMIT`.
+        overrides: `KEY=VALUE`s on top of the run's own configuration; the policy's networks stay
+            as they were saved.
         results_dir: where a run is looked for by its id.
         check: try the first actions out in the environment's physical check.
         window: show that check as it goes.
@@ -101,13 +98,15 @@ def evaluate(
     Raises:
         UserError: there is no such policy, it does not fit its configuration, or what is asked for
             can't be had.
+        EnvironmentFailure, NonFiniteError: the environment broke down.
     """
-    run, loaded, registries = find_run(policy, overrides, results_dir)
-    with closing(build_environment(run, FIRST_SEED + 2 * seed)) as env, ExitStack() as stack:
-        set_parameters(env, final_parameters(run))
-        player = _policy(run, registries, env, loaded, seed)
+    folder, run = find_run(policy, overrides, results_dir)
+    acting = Policy.load(policy, results_dir=results_dir, device=run.device, seed=seed)
+    count = episodes or run.environment.cls.evaluation_episodes
+    with closing(evaluation_environment(run, count)) as env, ExitStack() as stack:
+        _check_spaces(acting, env)
         evaluator = env.evaluator()
-        physical, pictures, gallery = None, None, None
+        physical, pictures, into = None, None, None
         if check:
             with _asked_for(f"the {evaluator.check_name}"):
                 physical = evaluator.physical_check(window=window)
@@ -115,27 +114,40 @@ def evaluate(
         if render is not None:
             with _asked_for("--render"):
                 pictures = evaluator.pictures()
-            where = Path(render) if render else run_folder(loaded.path) / EVALUATION
-            gallery = EvaluationFolder(where, pictures.file_names)
-        count = episodes or env.evaluation_episodes
-        report = evaluate_policy(player, env, count, seed, check=physical, pictures=pictures)
-        if pictures is not None and gallery is not None:
-            gallery.write(report, pictures.files())
+            into = EvaluationFolder(Path(render or folder / EVALUATION), pictures.file_names)
+        report = evaluate_policy(acting, env, count, seed, check=physical, pictures=pictures)
+        if pictures is not None and into is not None:
+            into.write(report, pictures.files())
     return Evaluation(report, report_figures(evaluator))
 
 
-def find_run(
-    policy: str, overrides: Sequence[str], results_dir: Path
-) -> tuple[RunSettings, Loaded, Registries]:
-    """The run a saved policy comes from, its weights, and the components that it may name.
+def find_run(policy: str, overrides: Sequence[str], results_dir: Path) -> tuple[Path, RunSettings]:
+    """Folder and settings of the run a saved policy comes from; its weights are not read.
 
     Raises:
         UserError: there is no such policy, or its configuration is not valid.
     """
-    registries = load_registries()
-    loaded = find_checkpoint(policy, results_dir)
-    run = load_run(run_folder(loaded.path) / CONFIGURATION, overrides, registries)
-    return run, loaded, registries
+    folder = find_run_folder(policy, results_dir)
+    return folder, load_run(folder / CONFIGURATION, overrides, load_registries())
+
+
+def _check_spaces(policy: Policy, env: Environment) -> None:
+    """Refuses an environment that shows or takes something else than the policy was trained on.
+
+    Raises:
+        UserError: with the first that differs.
+    """
+    shown = env.single_observation_space.spaces
+    pairs = [
+        (f"observation {name!r}", space, shown.get(name))
+        for name, space in policy.observation_space.spaces.items()
+    ]
+    for what, own, found in (*pairs, ("actions", policy.action_space, env.single_action_space)):
+        if own != found:
+            raise UserError(
+                f"the environment's {what}: {found}, where the policy was trained on {own}; leave "
+                "out the KEY=VALUE or the option that changes it"
+            )
 
 
 @contextmanager
@@ -147,26 +159,23 @@ def _asked_for(what: str) -> Iterator[None]:
         raise UserError(f"{what}: {error}") from error
 
 
-def final_parameters(run: RunSettings) -> dict[str, ParameterValue]:
-    """Environment parameters of the run's last lesson."""
-    curriculum = build_curriculum(run)
-    lesson = {} if curriculum is None else curriculum.final_parameters()
-    return {**run.environment_parameters, **lesson}
-
-
 def evaluation_environment(run: RunSettings, episodes: int) -> Environment:
     """Environments for evaluation alone: the run's, on its last lesson's task.
 
     Args:
         run: the settings.
         episodes: how many it will be evaluated by; there are no more environments than those.
+
+    Raises:
+        UserError: the environment refuses its settings or the last lesson's parameters.
     """
-    settings = run.environment.settings
-    if getattr(settings, "num_envs", 1) > episodes:
-        few = replace(run.environment, settings=settings.model_copy(update={"num_envs": episodes}))
-        run = replace(run, environment=few)
-    env = build_environment(run, FIRST_SEED)
-    set_parameters(env, final_parameters(run))
+    env = build_environment(run.with_environments(episodes), FIRST_SEED)
+    try:
+        with blaming_parameters():
+            env.set_parameters(final_parameters(run))
+    except BaseException:
+        env.close()
+        raise
     return env
 
 
@@ -178,6 +187,7 @@ def evaluate_policy(
     *,
     check: PhysicalCheck | None = None,
     pictures: EvaluationReport | None = None,
+    stop_requested: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
     """Evaluates a policy in environments that serve nothing else: they are reset.
 
@@ -189,9 +199,12 @@ def evaluate_policy(
         policy: acts.
         env: its own parameters are set already.
         episodes: how many, for the first actions and for the whole episodes each.
-        seed: of the episodes: equal seeds, equal beginnings.
+        seed: of the episodes: equal seeds, equal beginnings, for as many environments. Among whole
+            episodes that is so for the first of each environment; how those that follow begin may
+            depend on when the ones before them ended.
         check: what the first actions are tried out in.
         pictures: are shown the first actions.
+        stop_requested: asked before every step of the whole episodes.
 
     Returns:
         `episodes`, `seed`; of the whole episodes `success`, where it is known, the environment's
@@ -202,8 +215,10 @@ def evaluate_policy(
 
     Raises:
         UserError: the environment does not report what its figures are made of.
+        StopRequested: the evaluation is to stop.
+        EnvironmentFailure, NonFiniteError: the environment broke down.
     """
-    evaluator, env_runner = env.evaluator(), EnvRunner(env)
+    evaluator, env_runner = env.evaluator(), EnvRunner(env, stop_requested)
     first_seed = FIRST_SEED + 2 * seed
     first: dict[str, Any] = {}
     if evaluator.judges_first_action or check is not None or pictures is not None:
@@ -247,8 +262,9 @@ def _first_actions(
     env = env_runner.env
     metrics: list[Metrics] = []
     outcomes: list[Metrics] = []
-    for begin in range(0, episodes, env.num_envs):
-        env_runner.reset(seed if begin == 0 else None)
+    for batch, begin in enumerate(range(0, episodes, env.num_envs)):
+        # Seeded anew, for how many scenes the step before drew depends on what it came to.
+        env_runner.reset(seed + batch * SEEDS_PER_BATCH)
         actions, _ = policy.predict(env_runner.observations)
         # The last batch may have more environments than are asked for; and a step would reset them.
         asked_for = actions[: episodes - begin]
@@ -272,23 +288,14 @@ def _whole_episodes(
     Those that end first would be the short ones, not like the others.
     """
     parts: list[EpisodeBatch] = []
+    finished = 0
     env_runner.reset(seed)
     state: NDArray[Any] | None = None
-    while sum(map(len, parts)) < episodes:
+    while finished < episodes:
         actions, state = policy.predict(env_runner.observations, state, deterministic)
         done = env_runner.step(actions).done
         if state is not None:
             state[done] = 0.0
         parts.append(env_runner.pop_finished())
+        finished += len(parts[-1])
     return concatenate(parts)[:episodes]
-
-
-def _policy(
-    run: RunSettings, registries: Registries, env: Environment, loaded: Loaded, seed: int
-) -> Policy:
-    """The run's policy before an environment."""
-    network: PolicyNetwork = run.trainer.cls.build_policy(
-        build_factory(run, registries, env), run.trainer.settings
-    )
-    load_weights(network, loaded.weights, str(loaded.path))
-    return Policy(network, env.single_observation_space, env.single_action_space, seed)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from curricula.samplers import ParameterValue
 from envs.environment import Environment
 from rewards.reward import RewardTerm
 from trainers.algorithms.base import Algorithm
+from trainers.common.devices import resolve_device
 from trainers.common.errors import UserError, suggestion
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import EpisodeBatch
@@ -65,10 +67,13 @@ class Session:
             self.algorithm: Algorithm = run.trainer.cls(
                 factory, run.trainer.settings, self.env_runner, generator, device
             )
+            with blaming_parameters():
+                # The last lesson's first, so that they are not refused hours later.
+                for parameters in (final_parameters(run), self._parameters_now()):
+                    self.env_runner.set_parameters(parameters)
         except BaseException:
             env.close()
             raise
-        self.env_runner.set_parameters(self._parameters_now())
 
     @property
     def lesson(self) -> int:
@@ -146,39 +151,16 @@ class Session:
         return {**self._parameters, **lesson}
 
     def _check_parameters(self, env: Environment) -> None:
-        """Refuses parameters of the first and of the last lesson that the environment refuses.
-
-        Otherwise the run would end when a lesson begins.
-        """
-        first: dict[str, ParameterValue] = {}
-        last: dict[str, ParameterValue] = {}
+        sources = {"environment_parameters": self._parameters}
         if self.curriculum is not None:
             first = self.curriculum.parameters(self._curriculum_state)
-            last = self.curriculum.final_parameters()
-        sources = {"environment_parameters": self._parameters, "curriculum": {**first, **last}}
+            sources["curriculum"] = {**first, **self.curriculum.final_parameters()}
         for path, parameters in sources.items():
             for name in sorted(set(parameters) - env.parameter_names):
                 raise UserError(
                     f"{path}: the environment has no parameter {name!r}; "
                     f"{suggestion(name, env.parameter_names)}"
                 )
-        for lesson in (last, first):
-            set_parameters(env, {**self._parameters, **lesson})
-
-
-def resolve_device(name: str) -> torch.device:
-    """The torch device of a name, checked to be there.
-
-    Raises:
-        UserError: no such device.
-    """
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"device: {name!r} can't be used: {reason}; use 'cpu'") from error
-    return device
 
 
 def build_environment(run: RunSettings, seed: int) -> Environment:
@@ -195,24 +177,28 @@ def build_environment(run: RunSettings, seed: int) -> Environment:
     return env
 
 
-def set_parameters(env: Environment, parameters: Mapping[str, ParameterValue]) -> None:
-    """Sets environment parameters of the run file.
-
-    Raises:
-        UserError: the environment refuses a value.
-    """
-    try:
-        env.set_parameters(parameters)
-    except ValueError as error:
-        raise UserError(str(error)) from error
-
-
 def build_curriculum(run: RunSettings) -> Curriculum | None:
     """The run's curriculum, if it has one."""
     if run.curriculum is None:
         return None
     curriculum: Curriculum = _build(run.curriculum, "curriculum")
     return curriculum
+
+
+def final_parameters(run: RunSettings) -> dict[str, ParameterValue]:
+    """Environment parameters of the run's last lesson."""
+    curriculum = build_curriculum(run)
+    lesson = {} if curriculum is None else curriculum.final_parameters()
+    return {**run.environment_parameters, **lesson}
+
+
+@contextmanager
+def blaming_parameters() -> Iterator[None]:
+    """Turns an environment's ValueError about parameters into the user's mistake."""
+    try:
+        yield
+    except ValueError as error:
+        raise UserError(f"environment_parameters or curriculum: {error}") from error
 
 
 def _build(component: Component, path: str, *rest: Any) -> Any:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from gymnasium.spaces import Box
 
+from envs.environment import EnvironmentFailure
 from envs.evaluation import PhysicalCheckOption
 from envs.grasp.evaluation.report import GraspReport
 from trainers import evaluation
 from trainers.common.errors import UserError
 from trainers.evaluate import main
+from trainers.experience.env_runner import NonFiniteError
 from trainers.runfile.registry import Registries
 from trainers.saving.evaluation_folder import REPORT, EvaluationFolder
 from trainers.saving.run_folder import find_checkpoint
@@ -179,6 +184,59 @@ def test_an_option_that_there_is_already_is_the_environments_mistake(
     code, errors, _ = evaluate("darts")
     assert code == 2
     assert "'darts' offers an option that there is already: --seed" in errors
+
+
+def test_an_option_with_a_value_before_the_policy_is_told_where_it_belongs(
+    evaluate: Callable[..., Any], capfd: pytest.CaptureFixture[str]
+) -> None:
+    _, _, results = evaluate("darts")
+    assert main(["--darts", "3", str(results / "toy")]) == 2
+    errors = capfd.readouterr().err
+    assert errors.endswith("; the policy comes before --darts\n")
+    assert errors.startswith("error: 3: neither a run nor a checkpoint")
+
+
+def test_another_action_or_observation_than_the_policys_is_refused(
+    evaluate: Callable[..., Any], registries: Registries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    darts = registries.environments.get("darts").cls
+    for method, changed, told in (
+        ("actions", Box(-2.0, 2.0, (2,), np.float32), "actions: Box(-2.0, 2.0"),
+        ("spaces", {"goal": Box(-9.0, 9.0, (2,), np.float32)}, "observation 'goal': Box(-9.0"),
+    ):
+        with monkeypatch.context() as patch:
+            code, _, results = evaluate("darts")
+            assert code == 0
+            patch.setattr(darts, method, lambda self, changed=changed: changed)
+            with pytest.raises(UserError, match=re.escape(told) + ".*was trained on Box"):
+                evaluation.evaluate("toy", results_dir=results)
+
+
+@pytest.mark.parametrize(
+    ("failure", "told"),
+    [
+        (EnvironmentFailure("a worker died"), "error: a worker died\n"),
+        (NonFiniteError("step 4: the reward is nan"), "error: step 4: the reward is nan\n"),
+    ],
+)
+def test_a_breakdown_is_told_without_a_traceback(
+    evaluate: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
+    failure: Exception,
+    told: str,
+) -> None:
+    def broken(*_: Any, **__: Any) -> None:
+        raise failure
+
+    monkeypatch.setattr(evaluation, "evaluate_policy", broken)
+    assert evaluate("target")[:2] == (1, told)
+
+
+@pytest.mark.parametrize("seed", ["-1", str(2**31)])
+def test_a_seed_out_of_range_is_refused(capsys: pytest.CaptureFixture[str], seed: str) -> None:
+    with pytest.raises(SystemExit):
+        main(["nowhere", f"--seed={seed}"])
+    assert f"{seed} is not from 0 to 2147483647" in capsys.readouterr().err
 
 
 def test_a_policy_that_is_not_there_is_told(capsys: pytest.CaptureFixture[str]) -> None:

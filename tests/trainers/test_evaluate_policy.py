@@ -13,7 +13,8 @@ from gymnasium.spaces import Box
 from envs.environment import Environment
 from envs.evaluation import Evaluator, error, rate
 from trainers.common.errors import UserError
-from trainers.evaluation import FIRST_SEED, evaluate_policy
+from trainers.evaluation import FIRST_SEED, SEED_LIMIT, evaluate_policy
+from trainers.experience.env_runner import StopRequested
 
 EPISODES = 3  # the first to begin: two of the first environment's, one of the second's
 REWARD = [[1.0, 10.0], [2.0, 20.0], [3.0, 30.0], [4.0, 40.0], [5.0, 50.0]]
@@ -135,12 +136,20 @@ def test_scenes_are_of_the_seed_and_no_runs_own(
     monkeypatch.setattr(
         env, "reset", lambda *, seed=None: (seeds.append(seed), reset(seed=seed))[1]
     )
-    for seed in (0, 1):
+    last = SEED_LIMIT - 1
+    for seed in (0, 1, last, last):
         evaluate_policy(Counting(), env, EPISODES, seed, check=Check())
-    first, again, *others = seeds
-    assert again is None  # the second batch goes on from the first
-    assert len({first, *others} - {None}) == 4
-    assert min({first, *others} - {None}) >= FIRST_SEED
+    # Of each two batches of first actions, and the whole episodes.
+    assert seeds[6:9] == seeds[9:]
+    assert len(set(seeds)) == 9
+    assert min(seeds) >= FIRST_SEED
+
+
+def test_a_stop_ends_the_whole_episodes(env: Environment) -> None:
+    policy = Counting()
+    with pytest.raises(StopRequested):
+        evaluate_policy(policy, env, EPISODES, stop_requested=lambda: len(policy.deterministic) > 2)
+    assert len(policy.deterministic) == 3
 
 
 def test_a_figure_of_nothing_that_is_reported_names_the_nearest(

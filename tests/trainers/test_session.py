@@ -12,10 +12,11 @@ import torch
 
 from curricula.samplers import UniformSampler
 from trainers.common.errors import UserError
+from trainers.evaluation import evaluation_environment
 from trainers.experience.episodes import EpisodeBatch
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings
-from trainers.session import Session, resolve_device
+from trainers.session import Session
 
 MakeRun = Callable[..., RunSettings]
 MakeSession = Callable[..., Session]
@@ -77,37 +78,6 @@ def test_unknown_environment_parameters_name_where_they_stand(
     assert message == ("curriculum: the environment has no parameter 'size'; known: scale, shift")
 
 
-@pytest.mark.parametrize("lesson", [0, 2])
-def test_a_lessons_value_that_the_environment_refuses_ends_the_run_before_it_begins(
-    make_run: MakeRun, registries: Registries, monkeypatch: pytest.MonkeyPatch, lesson: int
-) -> None:
-    lessons = copy.deepcopy(LESSONS)
-    lessons["lessons"][lesson]["parameters"]["scale"] = -1.0  # type: ignore[index]
-    run = make_run("target", curriculum=lessons)
-    accept = run.environment.cls.set_parameters
-
-    def choosy(self: Any, parameters: dict[str, Any]) -> None:
-        if parameters["scale"] < 0.0:
-            raise ValueError(f"scale {parameters['scale']:g} must be over 0")
-        accept(self, parameters)
-
-    monkeypatch.setattr(run.environment.cls, "set_parameters", choosy)
-    with pytest.raises(UserError, match=r"^scale -1 must be over 0$"):
-        Session(run, registries)
-
-
-@pytest.mark.parametrize(
-    "device", ["cuda:77", "gpu", "cuda" if not torch.cuda.is_available() else "x"]
-)
-def test_a_device_that_is_not_there_is_the_users_mistake(device: str) -> None:
-    with pytest.raises(UserError, match=f"^device: '{device}' can't be used: .*; use 'cpu'$"):
-        resolve_device(device)
-
-
-def test_the_cpu_is_a_device() -> None:
-    assert resolve_device("cpu") == torch.device("cpu")
-
-
 def test_the_environment_is_closed_when_the_rest_does_not_fit(
     make_run: MakeRun, registries: Registries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -133,6 +103,34 @@ def test_settings_the_environment_refuses_name_its_section(
     monkeypatch.setattr(run.environment.cls, "__init__", refuse)
     with pytest.raises(UserError, match=r"^environment \(target\): too many blocks"):
         Session(run, registries)
+
+
+@pytest.mark.parametrize("lesson", [0, 1])
+def test_parameters_the_environment_refuses_are_the_users_mistake(
+    make_run: MakeRun,
+    registries: Registries,
+    monkeypatch: pytest.MonkeyPatch,
+    lesson: int,
+) -> None:
+    run = make_run("target", curriculum=LESSONS)
+    environment, refused_scale = run.environment.cls, (3.0, 1.0)[lesson]
+    accept, closed = environment.set_parameters, []
+
+    def set_parameters(self: Any, given: Any) -> None:
+        if given["scale"] == refused_scale:
+            raise ValueError(f"nothing fits in {refused_scale}")
+        accept(self, given)
+
+    monkeypatch.setattr(environment, "set_parameters", set_parameters)
+    monkeypatch.setattr(environment, "close_extras", lambda self, **_: closed.append(self))
+    message = r"^environment_parameters or curriculum: nothing fits in"
+    with pytest.raises(UserError, match=message):
+        Session(run, registries)
+    assert len(closed) == 1
+    if lesson == 1:
+        with pytest.raises(UserError, match=message):
+            evaluation_environment(run, 1)
+        assert len(closed) == 2
 
 
 def parameters(session: Session) -> dict[str, Any]:

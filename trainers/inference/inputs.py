@@ -37,7 +37,7 @@ def checked(
     problems = _name_problems(given, space, ignored)
     arrays: Arrays = {}
     lengths: dict[str, int | None] = {}
-    for name in space.spaces.keys() & given.keys():
+    for name in (name for name in space.spaces if name in given):
         array = np.asarray(given[name])
         shape = space[name].shape or ()
         if array.shape not in (shape, (*array.shape[:1], *shape)):

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from envs.environment import Environment
+from trainers.common.devices import resolve_device
 from trainers.common.errors import UserError
 from trainers.inference.construction import network_factory
 from trainers.inference.inputs import checked
@@ -83,13 +84,14 @@ class Policy:
             seed: of what `predict` draws when it is not deterministic.
 
         Raises:
-            UserError: there is no such policy, it is damaged, a plugin that it needs is not
-                installed here, or its weights don't fit.
+            UserError: there is no such policy or device, it is damaged, a plugin that it needs is
+                not installed here, or its weights don't fit.
         """
+        found_device = resolve_device(device)
         loaded = find_checkpoint(str(folder_or_run), Path(results_dir))
         folder = run_folder(loaded.path)
         metadata = find_metadata(folder)
-        network = _network(loaded, folder, metadata).to(device)
+        network = _network(loaded, folder, metadata).to(found_device).eval()
         return cls(network, metadata.observation_space, metadata.action_space, seed)
 
     @torch.no_grad()
@@ -156,8 +158,13 @@ def find_metadata(folder: Path) -> Metadata:
     if found := read_metadata(folder):
         return found
     registries = load_registries()
-    run = load_run(folder / CONFIGURATION, ["environment.num_envs=1"], registries)
-    env: Environment = run.environment.cls(run.environment.settings, [], 0)
+    run = load_run(folder / CONFIGURATION, [], registries).with_environments(1)
+    try:
+        env: Environment = run.environment.cls(run.environment.settings, [], 0)
+    except ValueError as error:
+        raise UserError(
+            f"{folder / CONFIGURATION}: environment ({run.environment.name}): {error}"
+        ) from error
     with closing(env):
         return Metadata.of_run(run, registries, env)
 
@@ -174,25 +181,11 @@ def _network(loaded: Loaded, folder: Path, metadata: Metadata) -> PolicyNetwork:
         registries.encoders,
     )
     network: PolicyNetwork = settings.trainer.cls.build_policy(factory, settings.trainer.settings)
-    load_weights(network, loaded.weights, str(loaded.path))
-    return network
-
-
-def load_weights(network: PolicyNetwork, weights: dict[str, torch.Tensor], where: str) -> None:
-    """Puts saved weights into a network.
-
-    Args:
-        network: changed in place.
-        weights: by name.
-        where: they come from, for the message.
-
-    Raises:
-        UserError: they don't fit; with torch's reason.
-    """
     try:
-        network.load_state_dict(weights)
+        network.load_state_dict(loaded.weights)
     except RuntimeError as error:
         reason = " ".join(line.strip() for line in str(error).splitlines()[:3])
         raise UserError(
-            f"{where}: these weights do not fit the networks of its {CONFIGURATION}: {reason}"
+            f"{loaded.path}: these weights do not fit the networks of its {CONFIGURATION}: {reason}"
         ) from error
+    return network

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from numpy.typing import NDArray
@@ -12,6 +12,21 @@ from trainers.common.errors import UserError, suggestion
 
 Metrics = Mapping[str, NDArray[Any]]
 """By name (k,), what was reported of k episodes, or of k actions."""
+
+
+FACTS = ("step", "episodes", "seed")
+"""Entries of a report that say what was evaluated, and are no figures."""
+
+
+def figure_values(report: Mapping[str, Any]) -> Iterator[tuple[str, str, float]]:
+    """The values of a report's figures: the entry's key, the part of it (`p95`), the number.
+
+    The part is empty where the entry is one number.
+    """
+    for key, value in report.items():
+        if key not in FACTS:
+            parts = value.items() if isinstance(value, Mapping) else (("", value),)
+            yield from ((key, part, float(number)) for part, number in parts)
 
 
 def report_figures(evaluator: Evaluator) -> dict[str, Figure]:

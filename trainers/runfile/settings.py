@@ -7,7 +7,7 @@ finds its class, and the class's own `Settings` model validates the section's ot
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,14 @@ class RunSettings:
     evaluation: EvaluationSettings | None
     seed: int
     device: str
+
+    def with_environments(self, most: int) -> RunSettings:
+        """The same with so many environments at most, where their number is a setting."""
+        settings = self.environment.settings
+        if getattr(settings, "num_envs", 1) <= most:
+            return self
+        few = settings.model_copy(update={"num_envs": most})
+        return replace(self, environment=replace(self.environment, settings=few))
 
 
 @dataclass(frozen=True)

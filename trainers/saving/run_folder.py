@@ -96,11 +96,26 @@ def find_checkpoint(name: str, results_dir: Path) -> Loaded:
     Raises:
         UserError: there is none.
     """
-    for directory in (Path(name), results_dir / name):
-        if (directory / CHECKPOINTS).is_dir():
-            return Checkpoints(directory / CHECKPOINTS, keep=1).load_best(with_state=False)
-        if (directory / MANIFEST).is_file():
-            return Checkpoints.load(directory, with_state=False)
+    folder = _find(name, results_dir)
+    if (folder / CHECKPOINTS).is_dir():
+        return Checkpoints(folder / CHECKPOINTS, keep=1).load_best(with_state=False)
+    return Checkpoints.load(folder, with_state=False)
+
+
+def find_run_folder(name: str, results_dir: Path) -> Path:
+    """The run's folder of what `find_checkpoint` finds; nothing in it is read.
+
+    Raises:
+        UserError: there is none.
+    """
+    folder = _find(name, results_dir)
+    return folder if (folder / CHECKPOINTS).is_dir() else run_folder(folder)
+
+
+def _find(name: str, results_dir: Path) -> Path:
+    for folder in (Path(name), results_dir / name):
+        if (folder / CHECKPOINTS).is_dir() or (folder / MANIFEST).is_file():
+            return folder
     raise UserError(f"{name}: neither a run nor a checkpoint, as it stands or under {results_dir}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict
+from pydantic import BaseModel
 
 from trainers.common.errors import UserError
 from trainers.inference.metadata import FILE
@@ -75,6 +77,7 @@ def test_one_observation_gets_one_action(saved: Save) -> None:
     folder, session = saved()
     batch = observations_of(session)
     policy = Policy.load(folder)
+    assert not any(module.training for module in policy.network.modules())
     actions, _ = policy.predict(batch)
     for row in range(len(actions)):
         one, state = policy.predict({name: values[row] for name, values in batch.items()})
@@ -152,6 +155,46 @@ def test_a_run_of_before_there_were_metadata_still_loads(
     monkeypatch.setattr("trainers.inference.policy.load_registries", lambda *_: registries)
     actions, _ = Policy.load(folder).predict(seen)
     np.testing.assert_array_equal(actions, expected)
+
+
+def test_an_environment_asked_for_its_spaces_need_not_count_itself(
+    saved: Save, monkeypatch: pytest.MonkeyPatch, registries: Registries
+) -> None:
+    folder, session = saved()
+    (folder / FILE).unlink()
+    monkeypatch.setattr("trainers.inference.policy.load_registries", lambda *_: registries)
+    environment = type(session.env_runner.env)
+    monkeypatch.setattr(environment, "Settings", Countless)
+    path = folder / CONFIGURATION
+    path.write_text(re.sub(r"  num_envs: .*\n|  privileged: .*\n", "", path.read_text()))
+    assert list(Policy.load(folder).observation_space) == ["goal"]
+
+    def refuse(*_: Any) -> None:
+        raise ValueError("it is too late in the day")
+
+    monkeypatch.setattr(environment, "__init__", refuse)
+    with pytest.raises(UserError, match=r"environment \(target\): it is too late in the day"):
+        Policy.load(folder)
+
+
+class Countless(BaseModel, frozen=True, extra="forbid"):
+    """Settings of an environment whose number is no setting."""
+
+    episode_steps: int = 4
+
+    @property
+    def num_envs(self) -> int:
+        return 1
+
+    @property
+    def privileged(self) -> bool:
+        return False
+
+
+def test_a_device_that_is_not_there_is_the_users_mistake(saved: Save) -> None:
+    folder, _ = saved()
+    with pytest.raises(UserError, match=r"^device: 'cuda:77' can't be used"):
+        Policy.load(folder, device="cuda:77")
 
 
 def test_what_is_no_policy_is_refused(tmp_path: Path) -> None:

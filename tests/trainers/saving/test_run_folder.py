@@ -17,6 +17,7 @@ from trainers.saving.run_folder import (
     begin,
     check,
     find_checkpoint,
+    find_run_folder,
     has_checkpoints,
     run_folder,
 )
@@ -87,6 +88,7 @@ def test_checkpoints_are_found_by_run_id_by_run_and_by_their_own_path(tmp_path: 
         assert found.weights["w"].tolist() == [float(step)]
         assert found.state is None
         assert run_folder(found.path) == run
+        assert find_run_folder(name, tmp_path / "results").resolve() == run
 
 
 def test_a_name_that_leads_nowhere_is_the_users_mistake(tmp_path: Path) -> None:
