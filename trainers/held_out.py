@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
+
+from torch import nn
 
 from trainers.common.errors import UserError, suggestion
 from trainers.common.timers import timed
 from trainers.evaluation import evaluate_policy, evaluation_environment
 from trainers.inference.policy import Policy
 from trainers.reporting.event_log import RunLog
+from trainers.reporting.figures import figure_values
 from trainers.runfile.settings import EvaluationSettings, RunSettings
 from trainers.session import Session
 
@@ -28,24 +32,33 @@ class HeldOutEvaluation:
         run: the settings, with their section `evaluation`.
         settings: that section.
         start_step: steps the run had when this process took it up.
+        stop_requested: asked before every step of the evaluation's environments.
 
     Attributes:
         latest: the last report, with the `step` that it is of; empty before the first.
+        begins_due: whether an evaluation is due at the very step at which the run is taken up.
 
     Raises:
-        UserError: the interval is too short, or the target's metric is not among the figures.
+        UserError: the interval is too short, the environment refuses the last lesson's parameters,
+            or the target's metric is not among the figures.
+        StopRequested: the first evaluation is to stop.
     """
 
     def __init__(
-        self, session: Session, run: RunSettings, settings: EvaluationSettings, start_step: int
+        self,
+        session: Session,
+        run: RunSettings,
+        settings: EvaluationSettings,
+        start_step: int,
+        stop_requested: Callable[[], bool] = lambda: False,
     ):
-        _check_interval(settings, session.algorithm.collection_steps)
-        self._settings, self._evaluated_at = settings, start_step
+        collection_steps = session.algorithm.collection_steps
+        _check_interval(settings, collection_steps)
+        self._settings, self._stop_requested = settings, stop_requested
+        self._evaluated_at = start_step - collection_steps
+        self.begins_due = self.due(start_step)
         self._env = evaluation_environment(run, settings.episodes)
-        network = session.algorithm.policy
-        self._policy = Policy(
-            network, self._env.single_observation_space, self._env.single_action_space
-        )
+        self._network = session.algorithm.policy
         self.latest: dict[str, Any] = {}
         try:
             self._evaluate(start_step)
@@ -60,18 +73,28 @@ class HeldOutEvaluation:
         return step // interval > self._evaluated_at // interval
 
     def evaluate(self, step: int, log: RunLog) -> None:
-        """Evaluates the policy as it is now, and logs what is found."""
+        """Evaluates the policy as it is now, and logs what is found.
+
+        Raises:
+            StopRequested: it is to stop; the latest report is that of before.
+            EnvironmentFailure, NonFiniteError: its environments broke down.
+        """
         self._evaluate(step)
         self.log(log)
 
     def log(self, log: RunLog) -> None:
         """Logs the latest report."""
-        log.scalars(dict(_tagged(self.latest)), self.latest["step"])
+        log.scalars(_tagged(self.latest), self.latest["step"])
+
+    @property
+    def scored_by(self) -> str:
+        """Figure that policies are scored by."""
+        return next(name for name in BEST_BY if name in self.latest)
 
     @property
     def score(self) -> float:
         """Score of the policy at the last evaluation; more is better."""
-        return next(float(self.latest[name]) for name in BEST_BY if name in self.latest)
+        return float(self.latest[self.scored_by])
 
     @property
     def target_reached(self) -> str | None:
@@ -87,19 +110,37 @@ class HeldOutEvaluation:
         self._env.close()
 
     def _evaluate(self, step: int) -> None:
-        with timed("evaluation"):
-            settings = self._settings
-            report = evaluate_policy(self._policy, self._env, settings.episodes, settings.seed)
+        settings, env, network = self._settings, self._env, self._network
+        # A new one each time: what it draws depends on the seed, not on the evaluations before.
+        policy = Policy(
+            network, env.single_observation_space, env.single_action_space, settings.seed
+        )
+        with timed("evaluation"), _evaluation_mode(network):
+            report = evaluate_policy(
+                policy, env, settings.episodes, settings.seed, stop_requested=self._stop_requested
+            )
         self._evaluated_at, self.latest = step, {"step": step, **report}
 
     def _check_target(self) -> None:
         target = self._settings.stop_when
-        known = [name for name, _ in _numbers(self.latest)]
+        known = [name for name, part, _ in figure_values(self.latest) if not part]
         if target is not None and target.metric not in known:
             raise UserError(
                 f"evaluation.stop_when.metric: {target.metric!r} is not among the figures of this "
                 f"environment's evaluation; {suggestion(target.metric, known)}"
             )
+
+
+@contextmanager
+def _evaluation_mode(network: nn.Module) -> Iterator[None]:
+    """Evaluation mode for a network; afterwards each of its modules is in its own mode again."""
+    training = [module for module in network.modules() if module.training]
+    network.eval()
+    try:
+        yield
+    finally:
+        for module in training:
+            module.training = True
 
 
 def _check_interval(settings: EvaluationSettings, collection_steps: int) -> None:
@@ -110,18 +151,9 @@ def _check_interval(settings: EvaluationSettings, collection_steps: int) -> None
         )
 
 
-def _numbers(report: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    for name, value in report.items():
-        if isinstance(value, (int, float)) and name not in ("step", "episodes", "seed"):
-            yield name, float(value)
-
-
-def _tagged(report: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    """TensorBoard's tags and what they show."""
-    for name, value in report.items():
-        title = name.replace("_", " ").title()
-        if isinstance(value, Mapping):
-            for part, number in value.items():
-                yield f"Evaluation/{title} {part.title()}", float(number)
-    for name, number in _numbers(report):
-        yield f"Evaluation/{name.replace('_', ' ').title()}", number
+def _tagged(report: Mapping[str, Any]) -> dict[str, float]:
+    """Figures by their TensorBoard tags."""
+    return {
+        f"Evaluation/{f'{name} {part}'.strip().replace('_', ' ').title()}": value
+        for name, part, value in figure_values(report)
+    }

@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
+from envs.environment import EnvironmentFailure
 from trainers.algorithms.base import TrainerSettings
 from trainers.common.errors import UserError
 from trainers.common.files import write_atomically
 from trainers.common.timers import Timer, recording
-from trainers.experience.env_runner import NonFiniteError
+from trainers.experience.env_runner import NonFiniteError, StopRequested
 from trainers.held_out import HeldOutEvaluation
 from trainers.inference.metadata import FILE as METADATA
 from trainers.reporting.event_log import RunLog
@@ -62,7 +63,10 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
         # Nothing is replaced before it is certain that the run can begin.
         resumed = _start(session, options, checkpoints)
         start = session.env_runner.step_count
-        held_out = stack.enter_context(_held_out(session, run, start))
+        try:
+            held_out = stack.enter_context(_held_out(session, run, start, stop_requested))
+        except StopRequested:
+            return False  # there is nothing to save yet that is not saved
         files = {CONFIGURATION: dump_yaml(run), METADATA: session.metadata.to_json()}
         begin(directory, files, resume=options.resume)
         with (
@@ -76,7 +80,8 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
             env = session.env_runner.env
             summary = Summary(log, run_id, env, settings.max_steps, settings.summary_freq, start)
             if held_out is not None:
-                if resumed is None:
+                # A checkpoint has no score where its evaluation was cut off: it is made up for.
+                if held_out.begins_due and (resumed is None or resumed.score is None):
                     held_out.log(log)
                 summary.note_evaluation(held_out.latest)
             training = Training(session, settings, log, summary, checkpoints, display, held_out)
@@ -95,12 +100,16 @@ def _timers_written(directory: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _held_out(session: Session, run: RunSettings, start: int) -> Iterator[HeldOutEvaluation | None]:
+def _held_out(
+    session: Session, run: RunSettings, start: int, stop_requested: Callable[[], bool]
+) -> Iterator[HeldOutEvaluation | None]:
     """Evaluation while the run learns; None unless the run file asks for it."""
     if run.evaluation is None:
         yield None
         return
-    with closing(HeldOutEvaluation(session, run, run.evaluation, start)) as held_out:
+    with closing(
+        HeldOutEvaluation(session, run, run.evaluation, start, stop_requested)
+    ) as held_out:
         yield held_out
 
 
@@ -147,6 +156,8 @@ def _start(
         loaded = checkpoints.load_latest()
         try:
             session.load_state_dict(loaded.weights, loaded.state)
+        except EnvironmentFailure:
+            raise
         except (RuntimeError, ValueError, KeyError) as error:
             raise UserError(
                 f"{loaded.path}: this checkpoint does not fit the run file, which must be the one "

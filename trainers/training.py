@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from envs.environment import EnvironmentFailure
 from trainers.algorithms.base import TrainerSettings
+from trainers.common.averager import Averager
 from trainers.common.timers import timed
 from trainers.experience.env_runner import StopRequested
 from trainers.held_out import HeldOutEvaluation
@@ -16,6 +18,9 @@ from trainers.reporting.summary import Summary
 from trainers.reporting.terminal import TerminalDisplay
 from trainers.saving.checkpoint import Checkpoints
 from trainers.session import Session
+
+REWARD, AGE = "reward", "age"
+"""Kinds of scores where there are no evaluations; by age means that the newest counts."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,7 @@ class Training:
         self._session, self._settings, self._held_out = session, settings, held_out
         self._log, self._summary, self._display = log, summary, display
         self._checkpoints = checkpoints
+        self._since_save = Averager()
 
     def run(self) -> Ending:
         """Trains until there is reason to end; what was learned is saved.
@@ -65,68 +71,89 @@ class Training:
             EnvironmentFailure: an environment broke down; the run is saved as of the last update.
             NonFiniteError: a reward, an observation or a loss is not finite; nothing new is saved.
         """
+        try:
+            return self._run()
+        except StopRequested:
+            return Ending(False, "stopped, and saved")
+
+    def _run(self) -> Ending:
         env_runner, max_steps = self._session.env_runner, self._settings.max_steps
         saved_at = env_runner.step_count
         while env_runner.step_count < max_steps:
-            # Between an update and the next collection is where a run can be taken up again.
-            step, boundary = env_runner.step_count, self._session.state_dict()
-            try:
-                self._learn(step / max_steps)
-            except (StopRequested, EnvironmentFailure) as stop:
-                self._save(step, boundary)
-                if isinstance(stop, StopRequested):
-                    return Ending(False, "stopped, and saved")
-                raise
             step = env_runner.step_count
-            evaluated = self._evaluate(step)
+            # Between an update and the next collection is where a run can be taken up again. It may
+            # share memory with what updates change: the state is of use until the next one.
+            with self._saved_if_cut_off(step, self._session.state_dict()), timed("collect"):
+                self._session.algorithm.collect()
+            self._update(step / max_steps)
+            step = env_runner.step_count
+            with self._saved_if_cut_off(step):
+                evaluated = self._evaluate(step)
             if evaluated or step - saved_at >= self._settings.checkpoint_interval:
                 saved_at = step
                 self._save(step)
-            if evaluated and (reached := evaluated.target_reached):
+            if evaluated and self._held_out and (reached := self._held_out.target_reached):
                 return Ending(True, reached)
         if saved_at < env_runner.step_count:
             self._save(env_runner.step_count)
         return Ending(True, f"max_steps: {max_steps} steps were taken")
 
-    def _learn(self, run_fraction: float) -> None:
-        """Collects and updates once, and tells what came of it."""
+    @contextmanager
+    def _saved_if_cut_off(self, step: int, state: dict[str, Any] | None = None) -> Iterator[None]:
+        """Saves the run where it is stopped, or an environment breaks down.
+
+        Args:
+            step: that of the state.
+            state: what to go on from; None: what the session then has.
+        """
+        try:
+            yield
+        except (StopRequested, EnvironmentFailure):
+            self._save(step, state)
+            raise
+
+    def _update(self, run_fraction: float) -> None:
+        """Learns from what was collected, and tells what came of it."""
         session, summary = self._session, self._summary
-        with timed("collect"):
-            session.algorithm.collect()
         with timed("update"):
             summary.add(session.algorithm.update(run_fraction))
         env_runner = session.env_runner
         episodes = env_runner.pop_finished()
         summary.add_episodes(episodes)
+        if len(episodes):
+            self._since_save.add({REWARD: float(episodes.rewards.mean())}, len(episodes))
         if session.advance_curriculum(episodes, env_runner.step_count / self._settings.max_steps):
             begins = f"step {env_runner.step_count}: {session.lesson_title} begins"
             self._display.message(begins)
         with timed("summary"):
             summary.report(session.position, env_runner.observations, self._display)
 
-    def _evaluate(self, step: int) -> HeldOutEvaluation | None:
-        """Evaluates where it is time to: at each interval, and at the run's end."""
+    def _evaluate(self, step: int) -> bool:
+        """Evaluates where it is time to, at each interval and at the run's end; whether it was."""
         held_out = self._held_out
         if held_out is None or not (held_out.due(step) or step >= self._settings.max_steps):
-            return None
+            return False
         held_out.evaluate(step, self._log)
         self._summary.note_evaluation(held_out.latest)
-        return held_out
+        return True
 
-    def _save(self, step: int, state: dict[str, Any] | None = None) -> Path:
+    def _save(self, step: int, state: dict[str, Any] | None = None) -> None:
         with timed("checkpoint"):
             state = {"step": step, **(state or self._session.state_dict())}
-            path = self._checkpoints.save(step, self._session.weights(), state, self._score(step))
+            score, score_of = self._score(step)
+            weights = self._session.weights()
+            path = self._checkpoints.save(step, weights, state, score, score_of)
         self._summary.note_checkpoint(path)
-        return path
 
-    def _score(self, step: int) -> float | None:
-        """Score that the best checkpoint is chosen by.
+    def _score(self, step: int) -> tuple[float | None, str]:
+        """Score that the best checkpoint is chosen by, if it has one, and what it is a score of.
 
-        By an evaluation of this very policy where there are evaluations. By the reward in training
-        otherwise; but those of different lessons can't be compared, and the newest counts.
+        By an evaluation of this very policy where there are evaluations. By the mean reward since
+        the last checkpoint otherwise; but those of different lessons can't be compared.
         """
         if self._held_out is not None:
-            latest = self._held_out.latest
-            return self._held_out.score if latest["step"] == step else None
-        return self._summary.reward if self._session.lesson_count == 1 else None
+            is_of_this = self._held_out.latest["step"] == step
+            score_of = f"evaluation.{self._held_out.scored_by}"
+            return self._held_out.score if is_of_this else None, score_of
+        reward = self._since_save.pop_means().get(REWARD)
+        return (reward, REWARD) if self._session.lesson_count == 1 else (None, AGE)

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from pydantic import BaseModel
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch import Tensor, nn
 
+from trainers.experience.env_runner import StopRequested
 from trainers.held_out import HeldOutEvaluation
 from trainers.learn import DONE, MISTAKE
-from trainers.runfile.settings import RunSettings
+from trainers.runfile.settings import Component, RunSettings
 from trainers.saving.checkpoint import Checkpoints
 from trainers.session import Session
 
@@ -64,6 +70,62 @@ def test_each_evaluated_policy_is_saved_with_its_own_score(
         assert found[step] == pytest.approx(successes[step])
 
 
+@pytest.fixture
+def held_out(
+    make_run: Callable[..., RunSettings], registries: Any
+) -> Callable[..., HeldOutEvaluation]:
+    """Evaluates an untrained policy in darts, where episodes are played with drawn actions."""
+
+    def make(**changes: Any) -> HeldOutEvaluation:
+        run = replace(make_run("darts", evaluation=EVERY_32), **changes)
+        assert run.evaluation is not None
+        return HeldOutEvaluation(Session(run, registries), run, run.evaluation, 0)
+
+    return make
+
+
+def test_equal_weights_have_equal_reports_though_actions_are_drawn(
+    held_out: Callable[..., HeldOutEvaluation],
+) -> None:
+    with closing(held_out()) as evaluation:
+        first = evaluation.latest
+        evaluation._evaluate(0)
+        assert evaluation.latest == first
+        assert evaluation.latest is not first
+
+
+class Forgetful(nn.Module):
+    """An encoder whose features are dropped at random while it learns; one part never learns."""
+
+    class Settings(BaseModel, frozen=True, extra="forbid"):
+        pass
+
+    def __init__(self, space: Any, settings: Settings):
+        super().__init__()
+        self.features_dim = space.shape[0]
+        self.dropout, self.frozen = nn.Dropout(0.5), nn.Dropout(0.5).eval()
+
+    def forward(self, values: Tensor) -> Tensor:
+        kept: Tensor = self.frozen(self.dropout(values))
+        return kept
+
+
+def test_nothing_is_dropped_while_a_policy_is_evaluated(
+    held_out: Callable[..., HeldOutEvaluation],
+) -> None:
+    encoder = Component("vector", Forgetful, Forgetful.Settings())
+    with closing(held_out(encoders={"goal": encoder})) as evaluation:
+        random_state, first = torch.get_rng_state(), evaluation.latest
+        evaluation._evaluate(0)
+        assert evaluation.latest == first
+        assert torch.equal(torch.get_rng_state(), random_state)
+        network = evaluation._network
+        modes = {type(m): m.training for m in network.modules() if not isinstance(m, nn.Dropout)}
+        assert all(modes.values())
+        (encoding,) = (m for m in network.modules() if isinstance(m, Forgetful))
+        assert (encoding.dropout.training, encoding.frozen.training) == (True, False)
+
+
 def test_training_is_not_touched_by_it(learn: Learn, write_run: WriteRun) -> None:
     weights = []
     for name, evaluation in (("with", EVERY_32), ("without", None)):
@@ -72,6 +134,37 @@ def test_training_is_not_touched_by_it(learn: Learn, write_run: WriteRun) -> Non
         weights.append(Checkpoints(path, 9).load_latest().weights)
     for name, tensor in weights[0].items():
         assert tensor.equal(weights[1][name]), name
+
+
+@pytest.mark.parametrize("stopped", ["at 48", "while it is evaluated at 64"])
+def test_a_resumed_run_has_the_points_of_an_uninterrupted_one(
+    learn: Learn, write_run: WriteRun, monkeypatch: pytest.MonkeyPatch, stopped: str
+) -> None:
+    constant = {"learning_rate_schedule": "constant", "beta_schedule": "constant"}
+    trainer = {"max_steps": 96, "hyperparameters": constant}
+    file = write_run("darts", trainer, evaluation=EVERY_32)
+    whole = learn(file, results_dir=file.parent / "whole")
+    if stopped == "at 48":
+        learn(file, "trainer.max_steps=48")
+    else:
+        evaluate = HeldOutEvaluation.evaluate
+
+        def stop(self: HeldOutEvaluation, step: int, log: Any) -> None:
+            if step == 64:
+                raise StopRequested
+            evaluate(self, step, log)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(HeldOutEvaluation, "evaluate", stop)
+            learn(file)
+    learned = learn(file, "--resume")
+    assert learned.code == DONE, learned.errors
+    for name in ("Reward", "First Action Success", "Distance M P95"):
+        tag = f"Evaluation/{name}"
+        found = points(learned, tag)
+        found.pop(48, None)  # the end of the shorter run was evaluated, too
+        assert found == points(whole, tag)
+        assert list(found) == [0, 32, 64, 96]
 
 
 def test_a_run_ends_at_its_target(learn: Learn, write_run: WriteRun) -> None:

@@ -13,7 +13,7 @@ import torch
 
 from envs.environment import EnvironmentFailure
 from trainers import training as training_module
-from trainers.experience.env_runner import NonFiniteError
+from trainers.experience.env_runner import NonFiniteError, StopRequested
 from trainers.reporting.summary import Summary
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings
@@ -45,6 +45,24 @@ class Quiet:
     update = scalars = images = status = ignore
 
 
+class HeldOut:
+    """An evaluation that ends in one way or another, every 32 steps."""
+
+    scored_by, score, target_reached = "success", 0.5, None
+
+    def __init__(self, ends_with: Exception | None = None):
+        self.latest = {"step": 0}
+        self._ends_with = ends_with
+
+    def due(self, step: int) -> bool:
+        return step % 32 == 0
+
+    def evaluate(self, step: int, log: Any) -> None:
+        if self._ends_with is not None:
+            raise self._ends_with
+        self.latest = {"step": step}
+
+
 class Training:
     """One training run in a temporary folder."""
 
@@ -74,12 +92,12 @@ class Training:
         self.session.load_state_dict(loaded.weights, loaded.state)
         return loaded
 
-    def train(self) -> bool:
+    def train(self, held_out: Any = None) -> bool:
         quiet: Any = self.quiet
         env, settings = self.session.env_runner.env, self.settings
         summary = Summary(quiet, "run", env, settings.max_steps, settings.summary_freq)
         loop = training_module.Training(
-            self.session, settings, quiet, summary, self.checkpoints, quiet
+            self.session, settings, quiet, summary, self.checkpoints, quiet, held_out
         )
         self.ending = loop.run()
         return self.ending.finished
@@ -291,6 +309,81 @@ def test_numbers_that_are_not_finite_save_nothing_new(
     assert one.saved == [16, 32]
     last = one.checkpoints.load_latest()
     assert all(torch.equal(last.weights[name], tensor) for name, tensor in good[32].items())
+
+
+def kinds(one: Training) -> dict[int, tuple[float | None, str]]:
+    return {e.step: (e.score, e.score_of) for e in one.checkpoints.list_checkpoints()}
+
+
+def test_an_evaluation_that_is_stopped_saves_the_run_unscored(
+    training: Callable[..., Training],
+) -> None:
+    one = training({"checkpoint_interval": 1000})
+    assert one.train(HeldOut(StopRequested())) is False
+    assert kinds(one) == {32: (None, "evaluation.success")}
+    assert one.checkpoints.load_latest().state["interaction"]["step_count"] == 32
+    assert one.ending.reason == "stopped, and saved"
+
+
+def test_an_evaluation_whose_environment_breaks_leaves_the_run_saved(
+    training: Callable[..., Training],
+) -> None:
+    one = training({"checkpoint_interval": 1000})
+    with pytest.raises(EnvironmentFailure, match="a cable came loose"):
+        one.train(HeldOut(EnvironmentFailure("a cable came loose")))
+    assert kinds(one) == {32: (None, "evaluation.success")}
+    again = training()
+    assert again.resume().step == 32
+    assert again.train() is True
+
+
+def test_an_evaluation_scores_the_policy_that_it_is_of_alone(
+    training: Callable[..., Training],
+) -> None:
+    one = training({"checkpoint_interval": 16}, stop_at_step=52)
+    one.train(HeldOut())
+    none = (None, "evaluation.success")
+    assert kinds(one) == {16: none, 32: (0.5, "evaluation.success"), 48: none}
+    one = training({"checkpoint_interval": 999}, stop_at_step=36, folder="stopped_at_once")
+    one.train(HeldOut())
+    assert kinds(one) == {32: (0.5, "evaluation.success")}
+
+
+def test_without_evaluations_the_reward_since_the_last_checkpoint_is_the_score(
+    training: Callable[..., Training], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = training({"checkpoint_interval": 32, "summary_freq": 1000})
+    rewards: list[list[float]] = []
+    add_episodes = Summary.add_episodes
+
+    def noted(summary: Summary, episodes: Any) -> None:
+        rewards.append(list(episodes.rewards))
+        add_episodes(summary, episodes)
+
+    monkeypatch.setattr(Summary, "add_episodes", noted)
+    one.train()
+    first, second, third, fourth = rewards
+    assert kinds(one) == {
+        32: (pytest.approx(np.mean(first + second)), "reward"),
+        64: (pytest.approx(np.mean(third + fourth)), "reward"),
+    }
+    lessons = training(curriculum=LESSONS, folder="lessons")
+    lessons.train()
+    assert set(kinds(lessons).values()) == {(None, "age")}
+
+
+def test_a_breakdown_while_updating_saves_nothing(
+    training: Callable[..., Training], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = training()
+
+    def update(_: float) -> Any:
+        raise EnvironmentFailure("nobody knows how")
+
+    monkeypatch.setattr(one.session.algorithm, "update", update)
+    with pytest.raises(EnvironmentFailure):
+        one.train()
+    assert one.saved == []
 
 
 def test_a_new_lesson_is_announced(training: Callable[..., Training]) -> None:

@@ -20,6 +20,7 @@ from trainers.reporting.event_log import RunLog
 from trainers.reporting.images import picture
 from trainers.reporting.terminal import RunStatus, TerminalDisplay
 
+REWARD_TAG = "Environment/Cumulative Reward"
 SUCCESS_TAG = "Environment/Success Rate"
 SUMMARIES_PER_PICTURE = 10
 
@@ -49,9 +50,6 @@ class Summary:
         max_steps: steps of the whole run.
         summary_freq: steps between two summaries.
         start_step: steps the run had when this process took it up.
-
-    Attributes:
-        reward: mean cumulative reward at the last summary; None before there was an episode.
     """
 
     def __init__(
@@ -76,11 +74,6 @@ class Summary:
         self._checkpoint: str | None = None
         self._evaluation: dict[str, Any] | None = None
 
-    @property
-    def reward(self) -> float | None:
-        """See the class."""
-        return self._last.get("Environment/Cumulative Reward")
-
     def add(self, statistics: Mapping[str, float]) -> None:
         """Adds the statistics of an update."""
         self._averager.add(statistics)
@@ -90,7 +83,7 @@ class Summary:
         if not len(episodes):
             return
         means = {
-            "Environment/Cumulative Reward": episodes.rewards.mean(),
+            REWARD_TAG: episodes.rewards.mean(),
             "Environment/Episode Length": episodes.lengths.mean(),
             **{f"Reward/{name}": total.mean() for name, total in episodes.terms.items()},
             **{
@@ -182,15 +175,12 @@ class Summary:
         left_s = (self._max_steps - step) / overall if overall > 0 else None
         return RunStatus(
             step=step,
-            reward=self.reward,
+            reward=self._last.get(REWARD_TAG),
             lesson=position.lesson or 0,
-            success=self._last_success(),
+            success=self._last.get(SUCCESS_TAG),
             steps_per_second=self._last.get("Performance/Steps Per Second"),
             seconds_left=None if left_s is None else max(left_s, 0.0),
         )
-
-    def _last_success(self) -> float | None:
-        return self._last.get(SUCCESS_TAG)
 
 
 def metric_tag(metric: str, figures: Sequence[Figure]) -> str:

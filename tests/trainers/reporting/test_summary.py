@@ -169,15 +169,14 @@ LESSONS = {
 def test_the_reward_is_that_of_the_last_summary(make_session: MakeSession) -> None:
     log, session = Log(), make_session("target", curriculum=LESSONS)
     summary = summary_of(log, session)
-    assert summary.reward is None
     summary.add_episodes(episodes([1.0, 2.0], success=[1, 0]))
     report(summary, session, 100)
-    assert summary.reward == 1.5
+    assert log.statuses[-1]["reward"] == 1.5
     assert log.points[100]["Environment/Lesson Number/lesson"] == 1
     session.advance_curriculum(episodes([1.0]), 0.5)
     summary.add_episodes(episodes([-3.0]))
     report(summary, session, 200)
-    assert summary.reward == -3.0
+    assert log.statuses[-1]["reward"] == -3.0
     assert log.points[200]["Environment/Lesson Number/lesson"] == 2
     assert log.statuses[-1]["lesson"] == log.statuses[-1]["lessons"] == 2
 
