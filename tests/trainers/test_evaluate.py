@@ -266,7 +266,7 @@ def test_a_window_needs_a_display(
     assert "no window can be opened" in errors
 
 
-class TestGallery:
+class TestEvaluationFolder:
     def write(self, folder: Path, content: bytes) -> None:
         EvaluationFolder(folder, ["a.png"]).write({"success": 0.5}, [("a.png", content)])
 
