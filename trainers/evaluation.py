@@ -263,7 +263,7 @@ def _first_actions(
     metrics: list[Metrics] = []
     outcomes: list[Metrics] = []
     for batch, begin in enumerate(range(0, episodes, env.num_envs)):
-        # Seeded anew, for how many scenes the step before drew depends on what it came to.
+        # Seeded anew, for how often the step before drew depends on what it came to.
         env_runner.reset(seed + batch * SEEDS_PER_BATCH)
         actions, _ = policy.predict(env_runner.observations)
         # The last batch may have more environments than are asked for; and a step would reset them.

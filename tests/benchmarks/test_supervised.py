@@ -31,10 +31,11 @@ def test_right_actions_succeed_on_the_last_lesson() -> None:
 
 def test_the_tolerances_are_the_goal_regions_in_actions() -> None:
     env = GraspVectorEnv(GraspSettings(simulator="fast", num_envs=1, workers=0), [])
+    env.reset(seed=0)
     env.close()
     # Half ranges of the workspace: 0.265, 0.45 and 0.2 m, and 40 degrees.
     np.testing.assert_allclose(
-        fit._tolerances(env), [0.005 / 0.265, 0.01 / 0.45, 0.01 / 0.2, 2.0 / 40.0], rtol=1e-5
+        fit._tolerances(env)[0], [0.005 / 0.265, 0.01 / 0.45, 0.01 / 0.2, 2.0 / 40.0], rtol=1e-5
     )
 
 
