@@ -30,10 +30,10 @@ class Step:
     Attributes:
         reward: (N,).
         terminated: (N,) the episode reached an end of its own: nothing follows.
-        truncated: (N,) the episode was cut off: what would follow has a value.
+        truncated: (N,) the episode was stopped from outside, by a limit of steps for instance.
         same_frame: (N,) the images of the new observation are those of the one before.
         final_observations: (N, ...) as they were before the reset, right where an episode ended;
-            None where none did. There wherever one was truncated.
+            None where none did. There wherever one was cut off.
     """
 
     reward: NDArray[np.float64]
@@ -46,6 +46,11 @@ class Step:
     def done(self) -> NDArray[np.bool_]:
         """(N,) the episode ended, terminated or truncated."""
         return self.terminated | self.truncated
+
+    @property
+    def cut_off(self) -> NDArray[np.bool_]:
+        """(N,) truncated and not terminated: what would follow has a value."""
+        return self.truncated & ~self.terminated
 
 
 class EnvRunner:
@@ -65,13 +70,17 @@ class EnvRunner:
         self.env, self._stop_requested = env, stop_requested
         self.step_count = 0
         self.observations: Mapping[str, NDArray[Any]] = {}
-        self._reward = np.zeros(env.num_envs)
-        self._length = np.zeros(env.num_envs)
-        self._terms: dict[str, NDArray[np.float64]] = {}
         self._number = np.zeros(env.num_envs, np.int64)  # of the running episodes
         self._begun = 0
         self.parameters_from = 0
-        self._cohorts = Cohorts(env.num_envs)
+        self._open_books()
+
+    def _open_books(self) -> None:
+        """Sums of the running episodes, and those that wait to be counted: none yet."""
+        count = self.env.num_envs
+        self._reward, self._length = np.zeros(count), np.zeros(count)
+        self._terms: dict[str, NDArray[np.float64]] = {}
+        self._cohorts = Cohorts(count)
 
     def set_parameters(self, parameters: Mapping[str, ParameterValue]) -> None:
         """Sets environment parameters; they are those of all episodes that begin from now on.
@@ -86,8 +95,14 @@ class EnvRunner:
         self.parameters_from = self._begun
 
     def reset(self, seed: int | None = None) -> None:
-        """Begins an episode everywhere; a seed says which ones."""
+        """Begins an episode everywhere; a seed says which ones.
+
+        Nothing is left of episodes that ran, nor of those that `pop_finished` did not give yet.
+        """
         self.observations, _ = self.env.reset(seed=seed)
+        self._open_books()
+        # All first episodes after a reset are of one cohort.
+        self._begun = -(-self._begun // self.env.num_envs) * self.env.num_envs
         self._begin(np.ones(self.env.num_envs, bool))
         self._check_observations(self.observations)
 
@@ -111,7 +126,9 @@ class EnvRunner:
         self._check_observations(observations)
         done = terminated | truncated
         final = infos.get("final_obs") if done.any() else None
-        if not final and (truncated & ~terminated).any():
+        same_frame = infos.get("same_frame", np.zeros(len(reward), bool))
+        step = Step(reward, terminated, truncated, same_frame, final or None)
+        if step.final_observations is None and step.cut_off.any():
             raise EnvironmentFailure(
                 f"step {self.step_count}: an episode was truncated, and the infos have no "
                 "`final_obs`: what would follow can't be valued without its last observation"
@@ -119,13 +136,7 @@ class EnvRunner:
         self._check_observations(final or {}, done)
         self._add_up(reward, terms, infos.get("episode_metrics", {}), done)
         self.observations = observations
-        return Step(
-            reward,
-            terminated,
-            truncated,
-            infos.get("same_frame", np.zeros(len(reward), bool)),
-            final,
-        )
+        return step
 
     def pop_finished(self) -> EpisodeBatch:
         """The finished episodes of the cohorts that were completed since the last call.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-SUCCESS = "success"
+from envs.evaluation import SUCCESS
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class EpisodeBatch:
     @property
     def successes(self) -> NDArray[np.bool_]:
         """(k,) False where the environment does not report success."""
-        return self.episode_metrics.get(SUCCESS, np.zeros(len(self))).astype(bool)
+        return self.episode_metrics.get(SUCCESS.metric, np.zeros(len(self))).astype(bool)
 
 
 def concatenate(parts: Sequence[EpisodeBatch]) -> EpisodeBatch:

@@ -241,7 +241,7 @@ class ReplayBuffer:
 
         What terminated has nothing after it that a learner could want to know the value of.
         """
-        cut, final = np.flatnonzero(step.truncated & ~step.terminated), step.final_observations
+        cut, final = np.flatnonzero(step.cut_off), step.final_observations
         self._final[indices] = NONE
         if not len(cut):
             return

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.environment import Environment
-from envs.evaluation import Figure
+from envs.evaluation import SUCCESS, Figure
 from trainers.common.averager import Averager
-from trainers.experience.episodes import SUCCESS, EpisodeBatch
+from trainers.experience.episodes import EpisodeBatch
 from trainers.experience.frames import frame_spaces
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.images import picture
@@ -185,7 +185,7 @@ class Summary:
 
 def metric_tag(metric: str, figures: Sequence[Figure]) -> str:
     """The TensorBoard tag of an episode metric: its figure's name, or its own where it has none."""
-    if metric == SUCCESS:
+    if metric == SUCCESS.metric:
         return SUCCESS_TAG
     name = next((figure.name for figure in figures if figure.metric == metric), metric)
     return f"Environment/{name.replace('_', ' ').title()}"

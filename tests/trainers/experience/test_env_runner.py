@@ -15,6 +15,7 @@ from envs.environment import EnvironmentFailure
 from trainers.experience.env_runner import (
     EnvRunner,
     NonFiniteError,
+    Step,
     StopRequested,
 )
 
@@ -263,6 +264,37 @@ def test_episodes_that_a_reset_cuts_off_keep_nothing_waiting(scripted: Any) -> N
     for _ in range(3):
         env_runner.step(ACTIONS)
     assert env_runner.pop_finished().number.tolist() == [2, 3]
+
+
+def test_a_reset_counts_nothing_of_what_it_cuts_off(scripted: Any) -> None:
+    """The first environment has begun a second episode by then."""
+    env_runner = begun(script(scripted))
+    for _ in range(2):
+        env_runner.step(ACTIONS)
+    env_runner.reset()
+    assert len(env_runner.pop_finished()) == 0  # its first episode had ended, and waited
+    for _ in range(3):
+        env_runner.step(ACTIONS)
+    episodes = env_runner.pop_finished()
+    assert episodes.number.tolist() == [4, 5]  # 3 was never begun: both are of one cohort
+    assert episodes.rewards.tolist() == [1 + 2, 10 + 20 + 40]
+    assert episodes.lengths.tolist() == [2, 3]
+    assert episodes.terms["near"].tolist() == [0.75, 17.5]
+
+
+def test_only_what_was_truncated_alone_is_cut_off() -> None:
+    terminated, truncated = np.array([[0, 1, 0, 1], [0, 0, 1, 1]], bool)
+    step = Step(np.zeros(4), terminated, truncated, np.zeros(4, bool), None)
+    assert step.cut_off.tolist() == [False, False, True, False]
+    assert step.done.tolist() == [False, True, True, True]
+
+
+def test_an_end_of_both_kinds_needs_no_last_observation(scripted: Any) -> None:
+    env_runner = begun(script(scripted, terminated=ENDS, final={}))
+    env_runner.step(ACTIONS)
+    step = env_runner.step(ACTIONS)
+    assert step.done.tolist() == [True, False]
+    assert step.final_observations is None
 
 
 def test_a_state_from_before_episodes_had_numbers_goes_on(scripted: Any) -> None:
