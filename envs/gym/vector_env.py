@@ -11,6 +11,7 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from numpy.typing import NDArray
 
 from envs.environment import Environment, EnvironmentFailure, ObservationArrays, StepResult
+from envs.gym.action_history import ActionHistory
 from envs.gym.making import make_vector_env
 from envs.gym.settings import GymSettings
 from envs.gym.spaces import ActionAdapter, ObservationAdapter
@@ -60,7 +61,8 @@ class GymEnvironment(Environment):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._begun = np.zeros(self.num_envs, np.int64)
         self._lengths = np.zeros(self.num_envs, np.int64)
-        self._actions: list[NDArray[Any]] = []  # as many steps as the longest episode has
+        # As many steps as the longest episode has.
+        self._history = ActionHistory(self.action_space.shape or (), self.action_space.dtype)
         self._observations: ObservationArrays = {}
 
     def reset(
@@ -79,7 +81,7 @@ class GymEnvironment(Environment):
             self._call("count_from", self._seed, self._begun)
         self._begun += 1
         self._lengths[:] = 0
-        self._actions.clear()
+        self._history.keep(0)
         observations, _ = self._guarded(self._vector.reset)
         self._observations = self._observe(observations)
         return self._observations, {}
@@ -91,11 +93,11 @@ class GymEnvironment(Environment):
             EnvironmentFailure: one of them raised an error, or its process died.
         """
         actions, before = self._act(actions), self._observations
-        # A copy: an environment may write to what it is given, and these are to be played again.
+        # A copy: an environment may write to what it is given, and so may a reward.
         observations, reward, terminated, truncated, gathered = self._guarded(
             self._vector.step, actions.copy()
         )
-        self._actions.append(actions)
+        self._history.append(actions)
         self._lengths += 1
         self._observations = self._observe(observations)
         infos = self._end_episodes(terminated | truncated, gathered)
@@ -115,12 +117,11 @@ class GymEnvironment(Environment):
 
     def state_dict(self) -> dict[str, Any]:
         """See `Environment.state_dict`."""
-        actions = np.array(self._actions, self.action_space.dtype)
         return {
             "seed": self._seed,
             "begun": self._begun.copy(),
             "lengths": self._lengths.copy(),
-            "actions": actions.reshape(-1, *(self.action_space.shape or ())),
+            "actions": self._history.actions,
             "observations": self._observations,
         }
 
@@ -128,7 +129,7 @@ class GymEnvironment(Environment):
         """See `Environment.load_state_dict`; plays the running episodes again."""
         self._seed = state["seed"]
         self._begun, self._lengths = state["begun"].copy(), state["lengths"].copy()
-        self._actions = list(state["actions"])
+        self._history.load(state["actions"])
         self._call("count_from", self._seed, self._begun - 1)
         played = self._call("play", self._lengths, state["actions"])
         self._observations = self._observe(self._stacked(played))
@@ -156,7 +157,7 @@ class GymEnvironment(Environment):
             return {}
         self._begun[done] += 1
         self._lengths[done] = 0
-        del self._actions[: len(self._actions) - self._lengths.max()]
+        self._history.keep(int(self._lengths.max()))
         return {"final_obs": self._final(gathered["final_obs"], done), "_final_obs": done}
 
     def _final(self, last: NDArray[Any], done: NDArray[np.bool_]) -> ObservationArrays:

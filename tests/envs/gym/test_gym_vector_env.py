@@ -452,6 +452,23 @@ def test_an_action_written_to_is_played_again_as_it_was(reusing: str) -> None:
     assert other.state_dict()["actions"].tolist() == [[[2.0], [4.0]]] * 3
 
 
+def test_an_action_that_a_reward_writes_to_is_played_again_as_it_was(reusing: str) -> None:
+    def scaled(transition: GymTransition) -> np.ndarray:
+        transition.actions[:] = -9.0
+        return np.zeros(2)
+
+    env, other = make(reusing, 2, [RewardTerm("scaled", 1.0, scaled)]), make(reusing, 2)
+    env.reset()
+    actions = np.array([[2.0], [4.0]])
+    for _ in range(3):
+        observations, *_ = env.step(actions)
+    assert actions.tolist() == [[2.0], [4.0]]
+    assert observations["observation"].tolist() == [[3.0], [6.0]]
+    state = env.state_dict()
+    assert state["actions"].tolist() == [[[2.0], [4.0]]] * 3
+    assert_same(other.load_state_dict(state), observations)
+
+
 # -- failures -------------------------------------------------------------------------------------
 
 
