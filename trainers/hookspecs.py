@@ -44,8 +44,8 @@ def ventosa_curricula() -> dict[str, type]:  # type: ignore[empty-body]
     """Offer curricula: name -> class that follows `curricula.curriculum.Curriculum`.
 
     It is built as `cls(settings)`, and is pure: its state is plain data, made by `initial_state()`,
-    replaced by `advance(state, episodes)`, and read by `lesson(state)` and `parameters(state)`.
-    Policies are judged on `final_parameters()`.
+    replaced by `advance(state, episodes)`, and read by `lesson(state)`, `lesson_name(state)` and
+    `parameters(state)`. Policies are judged on `final_parameters()`.
     """
 
 

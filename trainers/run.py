@@ -52,8 +52,7 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
     registries = load_registries()
     run = load_run(options.config, options.overrides + _flags(options), registries)
     settings = run.trainer.settings
-    if not isinstance(settings, TrainerSettings):
-        raise UserError(f"trainer: the settings of {run.trainer.name!r} lack the common ones")
+    assert isinstance(settings, TrainerSettings)  # the registry sees to it
     run_id = options.run_id or options.config.stem
     directory = options.results_dir / run_id
     checkpoints = Checkpoints(directory / CHECKPOINTS, settings.keep_checkpoints)

@@ -1,26 +1,17 @@
-"""The contract of a trainer (algorithm), and what all of them have in their settings."""
+"""The contract of a trainer (algorithm)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol
 
-from pydantic import BaseModel, Field
 from torch import Tensor
 
+from trainers.common.trainer_settings import TrainerSettings
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.policy_network import PolicyNetwork
 
-
-class TrainerSettings(BaseModel, frozen=True, extra="forbid"):
-    """Length of the training, and intervals of reports and checkpoints."""
-
-    max_steps: int = Field(
-        500_000, ge=1, description="Steps of the whole run, over all environments."
-    )
-    summary_freq: int = Field(10_000, ge=1, description="Steps between two summaries.")
-    checkpoint_interval: int = Field(100_000, ge=1, description="Steps between two checkpoints.")
-    keep_checkpoints: int = Field(5, ge=1, description="Checkpoints kept, next to the best.")
+__all__ = ("Algorithm", "TrainerSettings")
 
 
 class Algorithm(Protocol):
@@ -41,7 +32,7 @@ class Algorithm(Protocol):
 
     @staticmethod
     def build_policy(factory: NetworkFactory, settings: Any) -> PolicyNetwork:
-        """A new policy, whose weights are those of `policy`.
+        """A new policy, with weights of the same names and shapes as those of `policy`.
 
         All that acting needs: no optimizer, no experience, no environment.
 

@@ -21,6 +21,7 @@ from torch import nn
 from envs.environment import Environment
 from trainers import hookspecs
 from trainers.common.errors import UserError, suggestion
+from trainers.common.trainer_settings import TrainerSettings
 
 BUILT_IN = "built-in"
 BUILT_IN_PLUGINS = (
@@ -38,6 +39,7 @@ CURRICULUM_METHODS = (
     "parameters",
     "final_parameters",
 )
+TRAINER_METHODS = ("build_policy", "collect", "update", "state_dict", "load_state_dict")
 
 
 @dataclass(frozen=True)
@@ -247,8 +249,7 @@ def reward_breach(cls: type) -> str | None:
 
 def curriculum_breach(cls: type) -> str | None:
     """Say how a curriculum breaks its contract, or None."""
-    missing = [name for name in CURRICULUM_METHODS if not callable(getattr(cls, name, None))]
-    return f"{cls.__name__} has no method {missing[0]}" if missing else None
+    return missing_method(cls, CURRICULUM_METHODS)
 
 
 def environment_breach(cls: type) -> str | None:
@@ -257,9 +258,17 @@ def environment_breach(cls: type) -> str | None:
     return None if fits else f"{cls.__name__} is no envs.environment.Environment"
 
 
-def no_breach(cls: type) -> str | None:
-    """Accept a kind whose contract a class alone cannot show."""
-    return None
+def trainer_breach(cls: type) -> str | None:
+    """Say how a trainer breaks its contract, or None."""
+    if not issubclass(cls.Settings, TrainerSettings):  # type: ignore[attr-defined]
+        return f"{cls.__name__}.Settings is no trainers.algorithms.base.TrainerSettings"
+    return missing_method(cls, TRAINER_METHODS)
+
+
+def missing_method(cls: type, names: Iterable[str]) -> str | None:
+    """Say which method a class lacks first, or None."""
+    missing = next((name for name in names if not callable(getattr(cls, name, None))), None)
+    return f"{cls.__name__} has no method {missing}" if missing else None
 
 
 KINDS: dict[str, tuple[str, Callable[[type], str | None]]] = {
@@ -267,7 +276,7 @@ KINDS: dict[str, tuple[str, Callable[[type], str | None]]] = {
     "rewards": ("reward", reward_breach),
     "curricula": ("curriculum", curriculum_breach),
     "environments": ("environment", environment_breach),
-    "trainers": ("trainer", no_breach),
+    "trainers": ("trainer", trainer_breach),
 }
 """Field of `Registries` -> its kind, and what a class of that kind must keep to."""
 

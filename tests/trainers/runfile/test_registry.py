@@ -16,6 +16,7 @@ from torch import nn
 from envs.environment import Environment
 from trainers import hookspecs
 from trainers import plugins as command
+from trainers.common.trainer_settings import TrainerSettings
 from trainers.hookspecs import hookimpl
 from trainers.runfile import registry as plugins
 from trainers.runfile.listing import component_rows, type_name
@@ -72,7 +73,9 @@ class GoodEnvironment(Environment):
 
 
 class GoodTrainer:
-    Settings = Empty
+    Settings = TrainerSettings
+    build_policy = collect = update = lambda self: None
+    state_dict = load_state_dict = lambda self: None
 
 
 GOOD = {
@@ -107,7 +110,7 @@ def test_each_hook_fills_its_own_registry() -> None:
     for field, cls in GOOD.items():
         entry = getattr(registries, field).get(f"my_{field}")
         assert entry.cls is cls
-        assert entry.settings is Empty
+        assert entry.settings is cls.Settings
         assert entry.origin == Origin("fake", "built-in")
 
 
@@ -205,6 +208,15 @@ def call(self: Any) -> None: ...
             "E is no envs.environment.Environment",
         ),
         ("trainers", component("Bare"), "Bare has no nested pydantic model Settings"),
+        (
+            "trainers",
+            component("T", GoodTrainer, Settings=Empty),
+            "T.Settings is no trainers.algorithms.base.TrainerSettings",
+        ),
+        *(
+            ("trainers", component("T", GoodTrainer, **{name: None}), f"T has no method {name}")
+            for name in ("build_policy", "collect", "update", "state_dict", "load_state_dict")
+        ),
     ],
 )
 def test_a_broken_contract_is_named(field: str, cls: Any, reason: str) -> None:

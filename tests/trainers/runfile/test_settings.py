@@ -17,6 +17,7 @@ from torch import nn
 
 from curricula.samplers import UniformSampler
 from envs.environment import Environment
+from trainers.common.trainer_settings import TrainerSettings
 from trainers.hookspecs import hookimpl
 from trainers.runfile.registry import Registries, load_registries, plugin_manager
 from trainers.runfile.settings import RunSettings, SettingsError, dump_yaml, load_run, resolved
@@ -95,7 +96,10 @@ class Hyperparameters(Model):
 
 
 class Ppo:
-    class Settings(Model):
+    build_policy = collect = update = lambda self: None
+    state_dict = load_state_dict = lambda self: None
+
+    class Settings(TrainerSettings, frozen=True, extra="forbid"):
         hyperparameters: Hyperparameters = Hyperparameters()
         memory: Memory | None = None
         decay: float | Memory = 0.5
@@ -732,6 +736,9 @@ class TestResolved:
             "memory": None,
             "decay": 0.5,
             "max_steps": 10,
+            "summary_freq": 10_000,
+            "checkpoint_interval": 100_000,
+            "keep_checkpoints": 5,
         }
         assert data["seed"] == 0
 
