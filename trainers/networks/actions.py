@@ -42,10 +42,13 @@ class ActionScaling(nn.Module):
 
 
 def to_environment(actions: Tensor, space: gymnasium.Space[Any]) -> NDArray[Any]:
-    """Actions as the environment takes them: an array, within the bounds of a Box."""
+    """Actions as the environment takes them: an array, within a Box, or from a Discrete's start."""
     values = actions.cpu().numpy()
-    if isinstance(space, gymnasium.spaces.Box):
-        return np.clip(values, space.low, space.high)
+    match space:
+        case gymnasium.spaces.Box():
+            return np.clip(values, space.low, space.high)
+        case gymnasium.spaces.Discrete():
+            return values + space.start
     return values
 
 

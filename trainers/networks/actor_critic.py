@@ -31,10 +31,14 @@ class ActorCriticSettings(NetworkSettings, frozen=True, extra="forbid"):
     """Networks of an actor and a critic, and what each of them sees."""
 
     actor_observations: tuple[str, ...] | None = Field(
-        None, description="What the policy sees; null: all but those kept for a critic."
+        None,
+        min_length=1,
+        description="What the policy sees; null: all but those kept for a critic.",
     )
     critic_observations: tuple[str, ...] | None = Field(
-        None, description="What a separate critic sees; null: what the policy sees."
+        None,
+        min_length=1,
+        description="What a separate critic sees; null: what the policy sees.",
     )
 
 
@@ -217,12 +221,17 @@ def observed(
     """Names of the observations that the actor and the critic see.
 
     Raises:
-        UserError: the environment does not have them.
+        UserError: the environment does not have them, or keeps all of its own for a critic.
     """
     everything = tuple(factory.observation_space.spaces)
     actor = settings.actor_observations or tuple(
         name for name in everything if name not in factory.privileged
     )
+    if not actor:
+        raise UserError(
+            f"{NETWORK_PATH}.actor_observations: the environment keeps all its observations for a "
+            f"critic, so name those that the policy sees: {', '.join(everything)}"
+        )
     critic = settings.critic_observations or actor
     for path, names in (("actor_observations", actor), ("critic_observations", critic)):
         for name in names:

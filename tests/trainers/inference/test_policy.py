@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from gymnasium.spaces import Box, Dict
+from gymnasium.spaces import Box, Dict, Discrete
 from pydantic import BaseModel
 
 from trainers.common.errors import UserError
 from trainers.inference.metadata import FILE
 from trainers.inference.policy import Policy
+from trainers.networks.actor_critic import ActorCritic, PolicySettings
+from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import to_tensors
 from trainers.networks.recurrent import Sequences
 from trainers.runfile.registry import Registries
@@ -29,6 +31,7 @@ from trainers.session import Session
 
 REPOSITORY = Path(__file__).parents[3]
 MEMORY = {"network_settings": {"memory": {"type": "lstm", "memory_size": 4}}}
+CPU = torch.device("cpu")
 CAMERA = {"camera": {"type": "conv", "layers": [[4, 4, 2]]}}
 CRITIC = {"network_settings": {"critic": "separate", "critic_observations": ["privileged"]}}
 SHIPPED = REPOSITORY / "policies" / "grasp"
@@ -94,6 +97,20 @@ def test_images_and_discrete_actions(saved: Save) -> None:
     folder, session = saved("picture", encoders=CAMERA)
     actions, _ = Policy.load(folder).predict(observations_of(session))
     assert actions.shape == (4, 1)
+
+
+def test_choices_are_counted_from_where_the_space_begins(
+    make_factory: Callable[..., NetworkFactory],
+) -> None:
+    seen, space = {"joints": Box(-1.0, 1.0, (3,), np.float32)}, Discrete(3, start=5)
+    network = ActorCritic(make_factory(seen, action_space=space), PolicySettings())
+    policy = Policy(network, Dict(seen), space)
+    batch = {"joints": np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3)).astype(np.float32)}
+    chosen, _ = policy.predict(batch)
+    logits = network.action_head(network.actor(to_tensors(batch, policy.observation_space, CPU)))
+    assert chosen.tolist() == (5 + logits.argmax(1)).tolist()
+    drawn, _ = policy.predict(batch, deterministic=False)
+    assert set(drawn.tolist()) == {5, 6, 7}
 
 
 def test_memory_is_carried_by_the_caller(saved: Save) -> None:

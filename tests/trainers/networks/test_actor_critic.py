@@ -287,6 +287,26 @@ def test_unknown_observations_name_their_key_and_the_nearest(
     assert "no observation 'privilege'; did you mean 'privileged'?" in str(caught.value)
 
 
+@pytest.mark.parametrize("key", ["actor_observations", "critic_observations"])
+def test_nobody_sees_nothing(key: str) -> None:
+    with pytest.raises(ValidationError, match=f"{key}\\n.* at least 1 item"):
+        PolicySettings(critic="separate", **{key: ()})
+
+
+def test_an_environment_that_keeps_everything_for_a_critic_is_refused(
+    make_factory: MakeFactory,
+) -> None:
+    factory = make_factory({"privileged": SPACE["privileged"]})
+    with pytest.raises(UserError) as caught:
+        ActorCritic(factory, PolicySettings(**SIZES))
+    assert str(caught.value) == (
+        "trainer.network_settings.actor_observations: the environment keeps all its observations "
+        "for a critic, so name those that the policy sees: privileged"
+    )
+    named = PolicySettings(**SIZES, actor_observations=("privileged",))
+    assert ActorCritic(factory, named).sees == ("privileged",)
+
+
 def test_settings_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(ValidationError, match="critic_observations needs critic: separate"):
         PolicySettings(critic_observations=("privileged",))
