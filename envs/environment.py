@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -25,7 +25,7 @@ class EnvironmentFailure(RuntimeError):  # noqa: N818 - gymnasium's Error says s
     """An environment broke down, through no fault of the run file: a process died, for instance."""
 
 
-class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]]):
+class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC):
     """N environments stepped together, with dictionaries of observations.
 
     It resets an environment in the step its episode ends in (`AutoresetMode.SAME_STEP`). The
@@ -36,7 +36,8 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]]):
       need be neither stored nor encoded again.
     - `reward_terms`: the weighted rewards (N,) by name.
     - `episode_metrics`: by name, what to report of an episode (N,), read where it ends. `success`
-      among them is the success rate.
+      among them is the success rate. Where the evaluator `judges_first_action`, they are read after
+      the first action too, of episodes that go on.
 
     Arrays that were handed out, observations above all, are not written to afterwards.
 

@@ -114,7 +114,8 @@ class Evaluator:
         figures: of the environment's episode metrics. Success needs no declaration.
         judges_first_action: the deterministic policy's first action is judged by itself, and the
             whole episodes are played as at the end of training, exploration and all; otherwise
-            the deterministic policy plays them.
+            the deterministic policy plays them. The `episode_metrics` must then be there after an
+            episode's first action, as if it ended with it.
         check_name: what reports call the physical check.
     """
 

@@ -128,7 +128,7 @@ class Session:
         """Everything but the weights; taken between an update and the next collection."""
         return {
             "algorithm": self.algorithm.state_dict(),
-            "interaction": self.env_runner.state_dict(),
+            "interaction": self.env_runner.state_dict(),  # checkpoints have always called it so
             "curriculum": self._curriculum_state,
         }
 

@@ -23,7 +23,7 @@ Output = TypeVar("Output")
 
 
 @dataclass(frozen=True)
-class Acted(Generic[Output]):
+class BehaviorOutput(Generic[Output]):
     """Actions at N observations, and what comes with them.
 
     Attributes:
@@ -49,7 +49,7 @@ class Behavior(Protocol[Output]):
     def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
         """Features of U frames by name, (U, H, W, C)."""
 
-    def act(self, observations: Observations, features: FrameFeatures) -> Acted[Output]:
+    def act(self, observations: Observations, features: FrameFeatures) -> BehaviorOutput[Output]:
         """Actions at N observations, whose frames are known by their features alone."""
 
 
@@ -60,7 +60,7 @@ class CollectedStep(Generic[Output]):
     Attributes:
         observations: (N, ...) before the step, as the environments gave them.
         next_observations: (N, ...) after it; where an episode ended, the first of the next one.
-        frame_index: (N,) of each frame in the store.
+        frame_index: (N,) in the store, of the frame that each environment shows before the step.
         features: of the frames in view before the step.
         vectors: (N, n) by name, before the step.
         hidden_state: (N, m) before the observations.
@@ -74,7 +74,7 @@ class CollectedStep(Generic[Output]):
     features: FrameFeatures
     vectors: dict[str, Tensor]
     hidden_state: Tensor
-    acted: Acted[Output]
+    acted: BehaviorOutput[Output]
     step: Step
 
 

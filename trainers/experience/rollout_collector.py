@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from trainers.experience.collector import Acted, CollectedStep, Collector
+from trainers.experience.collector import BehaviorOutput, CollectedStep, Collector
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.frames import FrameStore
 from trainers.experience.returns import gae
@@ -22,7 +22,7 @@ from trainers.networks.frame_features import FrameFeatures
 from trainers.networks.observations import Observations, frames_differ
 from trainers.networks.recurrent import number_sequences
 
-Judged = tuple[Distribution, Tensor]
+DistributionAndValues = tuple[Distribution, Tensor]
 """The distribution that actions (N, ...) were drawn from, and the values (N,) of observations."""
 
 
@@ -43,7 +43,7 @@ class _RolloutStep:
     final_values: Tensor
     reward: NDArray[np.float64]
     terminated: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
+    cut_off: NDArray[np.bool_]
 
 
 class SampledActions:
@@ -62,10 +62,13 @@ class SampledActions:
         """See `Behavior.encode_frames`."""
         return self._policy.encode_frames(frames)
 
-    def act(self, observations: Observations, features: FrameFeatures) -> Acted[Judged]:
+    def act(
+        self, observations: Observations, features: FrameFeatures
+    ) -> BehaviorOutput[DistributionAndValues]:
         """See `Behavior.act`."""
         distribution, values, hidden_state = self._policy.step(observations, features)
-        return Acted(distribution.sample(self._generator), hidden_state, (distribution, values))
+        actions = distribution.sample(self._generator)
+        return BehaviorOutput(actions, hidden_state, (distribution, values))
 
 
 class RolloutCollector:
@@ -129,7 +132,7 @@ class RolloutCollector:
         """Everything needed to go on exactly."""
         normalizer = self._reward_normalizer
         return {
-            "remembered": self._collector.hidden_state,
+            "remembered": self._collector.hidden_state,  # checkpoints have always called it so
             "reward_normalizer": None if normalizer is None else normalizer.state_dict(),
         }
 
@@ -153,13 +156,13 @@ class RolloutCollector:
             final_values=self._final_values(collected),
             reward=collected.step.reward,
             terminated=collected.step.terminated,
-            truncated=collected.step.truncated,
+            cut_off=collected.step.cut_off,
         )
 
-    def _final_values(self, step: CollectedStep[Judged]) -> Tensor:
+    def _final_values(self, step: CollectedStep[DistributionAndValues]) -> Tensor:
         hidden_state, collector = step.acted.hidden_state, self._collector
         values = torch.zeros(len(hidden_state), device=self._device)
-        cut, final = np.flatnonzero(step.step.truncated), step.step.final_observations
+        cut, final = np.flatnonzero(step.step.cut_off), step.step.final_observations
         if not len(cut) or final is None:
             return values
         # With frame grab an episode's last image is its first, whose features are known.
@@ -177,7 +180,7 @@ class RolloutCollector:
 
     def _sequences(self, steps: list[_RolloutStep]) -> Tensor:
         """Numbers (M,) of the sequences that the transitions belong to."""
-        done = np.stack([step.terminated | step.truncated for step in steps])
+        done = np.stack([step.terminated | step.cut_off for step in steps])
         return self._tensor(number_sequences(done, self._policy.sequence_length).ravel())
 
     def _tensor(self, array: NDArray[Any]) -> Tensor:
@@ -196,8 +199,8 @@ class RolloutCollector:
             array = np.stack([getattr(step, name) for step in steps])
             return torch.from_numpy(array).to(self._device, dtype)
 
-        terminated, truncated = stack("terminated", torch.bool), stack("truncated", torch.bool)
-        done = terminated | truncated
+        terminated, cut_off = stack("terminated", torch.bool), stack("cut_off", torch.bool)
+        done = terminated | cut_off
         values = torch.stack([step.values for step in steps])
         final_values = torch.stack([step.final_values for step in steps])
         next_values = torch.cat([values[1:], last_values[None]])
@@ -207,7 +210,7 @@ class RolloutCollector:
         return gae(
             rewards,
             values,
-            torch.where(truncated, final_values, next_values),
+            torch.where(cut_off, final_values, next_values),
             terminated,
             done,
             gamma=gamma,

@@ -138,7 +138,14 @@ def test_an_end_that_is_both_counts_as_terminated(scripted: Any, make_factory: M
     )
     collector, policy = collector_on(env, make_factory, 1)
     value_is(policy, 1.0, 0.0)
-    assert collector.collect(gamma=0.5, lambd=0.5).advantages.tolist() == [2.0]  # 3 - V(1)
+    values: list[int] = []
+    policy.register_forward_hook(lambda *_: values.append(1))
+    with pytest.MonkeyPatch.context() as patch:
+        value = policy.value
+        patch.setattr(policy, "value", lambda seen, *known: values.append(1) or value(seen, *known))
+        rollout = collector.collect(gamma=0.5, lambd=0.5)
+    assert rollout.advantages.tolist() == [2.0]  # 3 - V(1)
+    assert len(values) == 1  # of what follows the last step; that of the end has no meaning
 
 
 def test_a_collection_goes_on_where_the_one_before_ended(
