@@ -54,6 +54,7 @@ class DDPG(OffPolicyAlgorithm):
 
     Settings = DDPGSettings
     policy: DeterministicPolicy
+    _hyperparameters: DDPGHyperparameters
 
     def __init__(
         self,
@@ -63,14 +64,14 @@ class DDPG(OffPolicyAlgorithm):
         generator: torch.Generator,
         device: torch.device,
     ):
-        self._hyperparameters = hyper = settings.hyperparameters
         policy = self.build_policy(factory, settings).to(device)
         parameters = {
             ACTOR: policy.online.actor_parameters(),
             CRITIC: policy.online.critic_parameters(),
         }
         super().__init__(policy, settings, parameters, env_runner, generator, device)
-        self._noise: Noise = hyper.noise.build(self._shape, device)
+        hyper = settings.hyperparameters
+        self._noise: Noise = hyper.noise.build(self._actions_shape, device)
         # Without a future there is no value to estimate, nor anything to observe.
         self._targets = self._bootstrapped_returns if hyper.gamma else self._buffer.rewards
 

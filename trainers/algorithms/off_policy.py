@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,7 +17,7 @@ from trainers.algorithms.base import TrainerSettings
 from trainers.algorithms.optimization import optimizer_step
 from trainers.algorithms.schedules import CONSTANT, Schedule
 from trainers.common.averager import Averager
-from trainers.experience.collector import Acted, CollectedStep, Collector
+from trainers.experience.collector import BehaviorOutput, CollectedStep, Collector
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.replay_buffer import ReplayBuffer
 from trainers.networks.frame_features import FrameFeatures
@@ -98,7 +98,7 @@ class OffPolicySettings(TrainerSettings, frozen=True, extra="forbid"):
     hyperparameters: OffPolicyHyperparameters
 
 
-class OffPolicyAlgorithm:
+class OffPolicyAlgorithm(ABC):
     """Collects transitions into a replay buffer, and updates from it. Implements `Algorithm`.
 
     A subclass says how to explore, and how critic and actor improve.
@@ -114,10 +114,21 @@ class OffPolicyAlgorithm:
         env_runner: the environments.
         generator: the source of all randomness.
         device: where the policy lives.
+
+    A subclass may use its arguments `policy`, `_settings`, `_parameters`, `_env_runner`,
+    `_generator` and `_device`, and these attributes.
+
+    Attributes:
+        _hyperparameters: of the settings; a subclass annotates its own type.
+        _buffer: the transitions, up to the last update.
+        _seen: names of the observations that the actor or a critic sees.
+        _actions_shape: (N, A).
+        _augment: to be called on all observations that are learned from.
     """
 
     policy: OffPolicyNetwork
     state_size = 0
+    _hyperparameters: OffPolicyHyperparameters
 
     def __init__(
         self,
@@ -128,13 +139,14 @@ class OffPolicyAlgorithm:
         generator: torch.Generator,
         device: torch.device,
     ):
-        self.policy, self._settings, self._replay = policy, settings, settings.hyperparameters
+        self.policy, self._settings = policy, settings
+        self._hyperparameters = hyper = settings.hyperparameters
         self._env_runner, self._generator, self._device = env_runner, generator, device
         self._parameters = parameters
         self._optimizers = {k: torch.optim.Adam(p, fused=True) for k, p in parameters.items()}
-        hyper, env, size = settings.hyperparameters, env_runner.env, policy.scale.size
+        env, size = env_runner.env, policy.scale.size
         self._seen = {*policy.sees, *policy.critic_sees}
-        self._shape = (env.num_envs, size)
+        self._actions_shape = (env.num_envs, size)
         self.collection_steps = settings.time_horizon * env.num_envs
         self._max_gradient_norm = hyper.max_gradient_norm or float("inf")
         self._buffer = ReplayBuffer(
@@ -161,7 +173,7 @@ class OffPolicyAlgorithm:
     def _improve_actor(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
         """One optimizer step of the actor on transitions (B,); statistics by TensorBoard tag."""
 
-    def _episodes_ended(self, done: NDArray[np.bool_]) -> None:
+    def _episodes_ended(self, done: NDArray[np.bool_]) -> None:  # noqa: B027 - may stay empty
         """Called after every step with (N,), for exploration with a state."""
 
     # -- collecting ------------------------------------------------------------------------------
@@ -181,32 +193,32 @@ class OffPolicyAlgorithm:
         """See `collector.Behavior.encode_frames`."""
         return self.policy.encode_frames(frames)
 
-    def act(self, observations: Observations, features: FrameFeatures) -> Acted[Tensor]:
+    def act(self, observations: Observations, features: FrameFeatures) -> BehaviorOutput[Tensor]:
         """See `collector.Behavior.act`; the output is the actions (N, A) in [-1, 1]."""
-        hyper, hidden_state = self._replay, self._collector.hidden_state
-        uniform = 2.0 * self._rand(self._shape) - 1.0
+        hyper, hidden_state = self._hyperparameters, self._collector.hidden_state
+        random = 2.0 * self._uniform(self._actions_shape) - 1.0
         if self._env_runner.step_count < hyper.buffer_init_steps:
-            return Acted(self.policy.scale(uniform), hidden_state, uniform)
+            return BehaviorOutput(self.policy.scale(random), hidden_state, random)
         explored = self._explore(observations, features)
-        drawn = self._rand((self._shape[0], 1)) < hyper.random_actions
-        actions = torch.where(drawn, uniform, explored)
-        return Acted(self.policy.scale(actions), hidden_state, actions)
+        drawn = self._uniform((self._actions_shape[0], 1)) < hyper.random_actions
+        actions = torch.where(drawn, random, explored)
+        return BehaviorOutput(self.policy.scale(actions), hidden_state, actions)
 
-    def _rand(self, shape: tuple[int, int]) -> Tensor:
+    def _uniform(self, shape: tuple[int, int]) -> Tensor:
+        """Numbers from 0 to 1."""
         return torch.rand(shape, generator=self._generator, device=self._device)
 
     # -- learning --------------------------------------------------------------------------------
 
     def update(self, run_fraction: float) -> Mapping[str, float]:
         """See `Algorithm.update`."""
-        collected, self._collected = self._collected, []
-        if not collected:
+        if not self._collected:
             raise RuntimeError("update() comes after collect()")
         scheduled = self._schedule(run_fraction)
-        self._store(collected)
-        averager, hyper = Averager(), self._replay
+        self._store_collected()
+        averager, hyper = Averager(), self._hyperparameters
         if len(self._buffer) >= hyper.buffer_init_steps:
-            self._pending_updates += len(collected) * self._shape[0] * hyper.updates_per_step
+            self._pending_updates += self.collection_steps * hyper.updates_per_step
         while self._pending_updates >= hyper.policy_delay:
             self._pending_updates -= hyper.policy_delay
             averager.add(self._update_once())
@@ -214,14 +226,14 @@ class OffPolicyAlgorithm:
 
     def _schedule(self, run_fraction: float) -> dict[str, float]:
         """Sets what changes over the run; returns it by TensorBoard tag."""
-        rate, critic_rate = self._replay.learning_rates(run_fraction)
+        rate, critic_rate = self._hyperparameters.learning_rates(run_fraction)
         for name, optimizer in self._optimizers.items():
             optimizer.param_groups[0]["lr"] = critic_rate if name == CRITIC else rate
         return {"Policy/Learning Rate": rate, "Policy/Critic Learning Rate": critic_rate}
 
     def _update_once(self) -> dict[str, float]:
         """Updates the critic `policy_delay` times, the actor and the targets once."""
-        hyper = self._replay
+        hyper = self._hyperparameters
         for _ in range(hyper.policy_delay):
             indices = self._buffer.sample(hyper.batch_size, self._generator)
             statistics = self._improve_critic(indices)
@@ -231,8 +243,12 @@ class OffPolicyAlgorithm:
         numbers = torch.stack([value.detach() for value in statistics.values()]).tolist()
         return dict(zip(statistics, numbers, strict=True))
 
-    def _store(self, collected: Sequence[CollectedStep[Tensor]]) -> None:
-        """Adds what was collected to the buffer and to the statistics of the observations."""
+    def _store_collected(self) -> None:
+        """Moves what was collected to the buffer and to the statistics of the observations.
+
+        Nothing of it is kept: its images would take up memory during all updates.
+        """
+        collected, self._collected = self._collected, []
         for step in collected:
             actions = step.acted.output.cpu().numpy()
             self._buffer.add(step.observations, actions, step.step, step.next_observations)
@@ -257,11 +273,11 @@ class OffPolicyAlgorithm:
 
     def state_dict(self) -> dict[str, Any]:
         """See `Algorithm.state_dict`."""
-        saved = self._replay.save_replay_buffer
+        saved = self._hyperparameters.save_replay_buffer
         return {
             **{f"{name}_optimizer": each.state_dict() for name, each in self._optimizers.items()},
             "generator": self._generator.get_state(),
-            "due": self._pending_updates,
+            "due": self._pending_updates,  # checkpoints have always called it so
             "replay_buffer": self._buffer.state_dict() if saved else None,
         }
 

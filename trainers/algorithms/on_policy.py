@@ -116,7 +116,6 @@ class OnPolicyAlgorithm:
         Raises:
             NonFiniteError: the loss or its gradient is NaN or infinite; nothing was changed.
         """
-        groups = self._optimizer.param_groups
-        parameters = [p for group in groups for p in group["params"] if p.requires_grad]
+        parameters = [p for group in self._optimizer.param_groups for p in group["params"]]
         step = self._env_runner.step_count
         optimizer_step(self._optimizer, loss, parameters, self._max_gradient_norm, step)

@@ -23,26 +23,31 @@ def optimizer_step(
     Args:
         optimizer: of the parameters.
         loss: a number.
-        parameters: what may change.
+        parameters: what may change; frozen ones among them stay as they are.
         max_gradient_norm: the gradient is clipped to this norm.
         step: of the run, for the message.
 
     Raises:
         NonFiniteError: the loss or its gradient is not finite; the parameters are as before.
     """
-    gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
-    for parameter, gradient in zip(parameters, gradients, strict=True):
+    learned = [parameter for parameter in parameters if parameter.requires_grad]
+    gradients = torch.autograd.grad(loss, learned, allow_unused=True)
+    for parameter, gradient in zip(learned, gradients, strict=True):
         parameter.grad = gradient
     norm = nn.utils.get_total_norm([part for part in gradients if part is not None])
-    check_finite(loss, norm, step)
-    if norm > max_gradient_norm:
-        nn.utils.clip_grads_with_norm_(parameters, max_gradient_norm, norm)
+    if check_finite(loss, norm, step) > max_gradient_norm:
+        nn.utils.clip_grads_with_norm_(learned, max_gradient_norm, norm)
     optimizer.step()
 
 
-def check_finite(loss: Tensor, gradient_norm: Tensor, step: int) -> None:
-    """Raises NonFiniteError, naming the run's step, where a loss or its gradient is not finite."""
-    if not math.isfinite((loss + gradient_norm).item()):
-        raise NonFiniteError(
-            f"step {step}: the loss is {loss.item()}, its gradient's norm {gradient_norm.item()}"
-        )
+def check_finite(loss: Tensor, gradient_norm: Tensor, step: int) -> float:
+    """The gradient's norm as a number.
+
+    Raises:
+        NonFiniteError: the loss or the norm is not finite; the message names the run's step.
+    """
+    # Both at once: on an accelerator each number read waits for all that is under way.
+    value, norm = torch.stack((loss.detach(), gradient_norm)).tolist()
+    if not math.isfinite(value + norm):
+        raise NonFiniteError(f"step {step}: the loss is {value}, its gradient's norm {norm}")
+    return float(norm)

@@ -165,9 +165,9 @@ class PPO(OnPolicyAlgorithm):
             self._optimizer_step(loss)
             # All at once: on an accelerator each number read waits for all that is under way.
             statistics = torch.stack((divergence, clip_fraction, policy_loss, value_loss, entropy))
-            means = statistics.tolist()
+            kl, *_ = means = statistics.tolist()
             averager.add(dict(zip(STATISTICS, means, strict=True)), len(rows))
-            if hyper.target_kl is not None and means[0] > hyper.target_kl:
+            if hyper.target_kl is not None and kl > hyper.target_kl:
                 return False
         return True
 

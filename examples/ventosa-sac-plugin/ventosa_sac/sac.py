@@ -51,6 +51,7 @@ class SAC(OffPolicyAlgorithm):
 
     Settings = SACSettings
     policy: SACPolicy
+    _hyperparameters: SACHyperparameters
 
     def __init__(
         self,
@@ -60,7 +61,6 @@ class SAC(OffPolicyAlgorithm):
         generator: torch.Generator,
         device: torch.device,
     ):
-        self._hyperparameters = settings.hyperparameters
         policy = self.build_policy(factory, settings).to(device)
         parameters = {
             ACTOR: list(policy.actor.parameters()),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import weakref
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -19,6 +20,7 @@ from trainers.algorithms.ddpg import DDPG, DDPGHyperparameters, DDPGSettings
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner, NonFiniteError
 from trainers.experience.episodes import concatenate
+from trainers.inference.policy import Policy
 from trainers.networks.deterministic import DeterministicPolicy, DeterministicSettings
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.frame_features import FrameFeatures
@@ -252,6 +254,41 @@ def test_observations_are_standardised_alike_for_everyone(make_ddpg: MakeDDPG) -
         torch.testing.assert_close(mean, goal.double().mean(0))
 
 
+@pytest.mark.parametrize("critic", ["separate", "shared"])
+def test_a_frozen_encoder_stays_as_it_is_and_the_rest_learns(
+    make_ddpg: MakeDDPG, critic: str
+) -> None:
+    algorithm = make_ddpg("picture", {}, {"critic": critic}, encoders=CAMERA)
+    online = algorithm.policy.online
+    encoders = [online.critic_encoder, *filter(None, [online.actor_encoder])]
+    frozen = [p for encoder in encoders for p in encoder.requires_grad_(False).parameters()]
+    before, heads = snapshot(frozen), (online.actor, online.critic)
+    before_heads = [snapshot(part.parameters()) for part in heads]
+    one_round(algorithm)
+    assert frozen
+    assert not changed(before, frozen)
+    for earlier, part in zip(before_heads, heads, strict=True):
+        assert changed(earlier, part.parameters())
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU: DDPG on CUDA")
+def test_it_learns_and_goes_back_on_cuda(make_ddpg: MakeDDPG) -> None:
+    algorithm = make_ddpg("target", {}, {"normalize": True}, device="cuda")
+    before = snapshot(algorithm.policy.online.parameters())
+    assert all(math.isfinite(value) for value in one_round(algorithm).values())
+    assert changed(before, algorithm.policy.online.parameters())
+    online, target = algorithm.policy.online.buffers(), algorithm.policy.target.buffers()
+    assert not changed(list(online), target)
+    env = algorithm._env_runner.env
+    policy = Policy(algorithm.policy, env.single_observation_space, env.single_action_space)
+    actions, _ = policy.predict(algorithm._env_runner.observations)
+    weights = {k: v.clone() for k, v in algorithm.policy.state_dict().items()}
+    algorithm.load_state_dict(weights, copy.deepcopy(algorithm.state_dict()))
+    again, _ = policy.predict(algorithm._env_runner.observations)
+    np.testing.assert_array_equal(actions, again)
+    assert all(math.isfinite(value) for value in one_round(algorithm).values())
+
+
 # -- settings ------------------------------------------------------------------------------------
 
 
@@ -414,6 +451,26 @@ def test_update_needs_a_collection_of_its_own(make_ddpg: MakeDDPG) -> None:
     one_round(algorithm)
     with pytest.raises(RuntimeError, match="after collect"):
         algorithm.update(0.0)
+
+
+def test_a_collection_is_given_back_before_the_updates(
+    make_ddpg: MakeDDPG, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its images would take up memory beside those in the buffer."""
+    algorithm = make_ddpg()
+    algorithm.collect()
+    steps = [weakref.ref(step) for step in algorithm._collected]
+    left: list[int] = []
+
+    def improve(indices: Any) -> dict[str, Tensor]:
+        left.append(sum(step() is not None for step in steps))
+        return {}
+
+    monkeypatch.setattr(algorithm, "_improve_critic", improve)
+    monkeypatch.setattr(algorithm, "_improve_actor", lambda _: {"loss": torch.zeros(())})
+    algorithm.update(0.0)
+    assert len(steps) == 4
+    assert left == [0] * 16
 
 
 def test_a_collection_that_is_begun_again_is_learned_from_once(make_ddpg: MakeDDPG) -> None:

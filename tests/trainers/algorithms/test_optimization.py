@@ -31,6 +31,13 @@ def test_other_parameters_get_no_gradient() -> None:
     assert other.grad is None
 
 
+def test_frozen_parameters_stay_as_they_are() -> None:
+    learned, frozen = nn.Parameter(torch.ones(())), nn.Parameter(torch.ones(()), False)
+    parameters = [frozen, learned]
+    optimizer_step(torch.optim.SGD(parameters, 1.0), 3.0 * learned * frozen, parameters, 0.5, 7)
+    assert (learned.item(), frozen.item()) == (pytest.approx(0.5, rel=1e-4), 1.0)
+
+
 @pytest.mark.parametrize("scale", [float("nan"), INFINITE, 1e30])
 def test_what_is_not_finite_changes_nothing(scale: float) -> None:
     """The last one's loss is finite, its gradient's norm is not."""

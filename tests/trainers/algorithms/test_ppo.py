@@ -27,6 +27,7 @@ from trainers.algorithms.ppo import (
 )
 from trainers.experience.env_runner import EnvRunner, NonFiniteError
 from trainers.experience.episodes import concatenate
+from trainers.inference.policy import Policy
 from trainers.networks.distributions import Categorical, DiagonalGaussian
 from trainers.networks.factory import NetworkFactory
 from trainers.session import Session
@@ -420,6 +421,26 @@ def test_going_back_to_a_state_repeats_everything(make_ppo: MakePPO) -> None:
 
 
 # -- learning ------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU: PPO on CUDA")
+@pytest.mark.parametrize("memory", [None, {"type": "lstm", "memory_size": 4}])
+def test_it_learns_and_goes_back_on_cuda(make_ppo: MakePPO, memory: Any) -> None:
+    """From images in uint16, which torch has fewer operations for on a GPU."""
+    camera = {"camera": {"type": "conv", "layers": [[8, 8, 1]]}}
+    algorithm = make_ppo("picture", {}, {"memory": memory}, encoders=camera, device="cuda")
+    before = snapshot(algorithm.policy.parameters())
+    statistics, _ = one_round(algorithm)
+    assert all(math.isfinite(value) for value in statistics.values())
+    assert changed(before, algorithm.policy.parameters())
+    env = algorithm._env_runner.env
+    policy = Policy(algorithm.policy, env.single_observation_space, env.single_action_space)
+    actions, _ = policy.predict(algorithm._env_runner.observations)
+    weights = {k: v.clone() for k, v in algorithm.policy.state_dict().items()}
+    algorithm.load_state_dict(weights, copy.deepcopy(algorithm.state_dict()))
+    again, _ = policy.predict(algorithm._env_runner.observations)
+    np.testing.assert_array_equal(actions, again)
+    one_round(algorithm)
 
 
 def learned(algorithm: PPO, rounds: int) -> tuple[float, float]:
