@@ -507,7 +507,7 @@ def test_bad_input_is_refused_with_its_name() -> None:
         simulator.render(both, spoilt(view, "rotation", 2.0))
     with pytest.raises(ValueError, match="near_m of the views"):
         simulator.render(both, spoilt(view, "near_m", 9.0))
-    with pytest.raises(ValueError, match=r"noise_sigma_m.*finite"):
+    with pytest.raises(ValueError, match=r"noise_sigma_m must be within 0 and 1"):
         simulator.render_depth(
             both, spoilt(view, "noise_sigma_m", np.nan), DepthImage(80, 80), seeds
         )
