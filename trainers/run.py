@@ -28,6 +28,7 @@ from trainers.saving.run_folder import (
     begin,
     check,
     find_checkpoint,
+    run_folder,
 )
 from trainers.session import Session
 from trainers.training import Ending, Training
@@ -159,18 +160,20 @@ def _start(
             raise
         except (RuntimeError, ValueError, KeyError) as error:
             raise UserError(
-                f"{loaded.path}: this checkpoint does not fit the run file, which must be the one "
-                f"the run began with: {_first_line(error)}"
+                f"{loaded.path}: the run can't go on from here: {_first_line(error)}. --resume "
+                "needs the run file, and the version of ventosa, that the run began with; to begin "
+                f"another run with its weights, use --initialize-from {run_folder(loaded.path)}"
             ) from error
         return loaded
     if options.initialize_from:
-        weights = find_checkpoint(options.initialize_from, options.results_dir).weights
+        loaded = find_checkpoint(options.initialize_from, options.results_dir)
         try:
-            session.algorithm.policy.load_state_dict(weights)
+            session.algorithm.policy.load_state_dict(loaded.weights)
         except RuntimeError as error:
             raise UserError(
                 f"--initialize-from {options.initialize_from}: these weights do not fit the run "
-                f"file's networks: {_first_line(error)}"
+                f"file's networks: {_first_line(error)}. They are for the observations and "
+                f"networks of {run_folder(loaded.path) / CONFIGURATION}"
             ) from error
     session.reset()
     return None
@@ -188,4 +191,4 @@ def _flags(options: argparse.Namespace) -> list[str]:
 
 def _first_line(error: Exception) -> str:
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return " ".join(lines[:2])
+    return " ".join(lines[:2]).rstrip(".")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import (
     AfterValidator,
@@ -218,6 +219,16 @@ class Pick(BaseModel, frozen=True, extra="forbid"):
 
 class GraspSettings(BaseModel, frozen=True, extra="forbid"):
     """The grasp task: a KUKA KR 16 brings its suction cup in front of the nearest block."""
+
+    # What became of keys that run files of before have.
+    dropped_keys: ClassVar[Mapping[str, str]] = {
+        "motion_checks": "contacts are looked for all along a motion, every contact_resolution_m; "
+        "`motion: direct` is the motion of before"
+    }
+    renamed_keys: ClassVar[Mapping[str, str]] = {
+        "pick.standoff_m": "standoff_m",
+        "pick.standoff_s": "pick.approach_s",
+    }
 
     simulator: Literal["pybullet", "fast"] = Field(
         "pybullet",

@@ -15,6 +15,7 @@ from pydantic import BaseModel, Field, TypeAdapter
 
 from curricula.samplers import ParameterValue
 from trainers.common.errors import suggestion
+from trainers.runfile.former_keys import brought_up_to_date, tell
 from trainers.runfile.registry import Registries, Registry, UnknownComponentError
 from trainers.runfile.validation import InvalidError, Model, not_finite, validate
 from trainers.runfile.yaml_document import (
@@ -307,6 +308,9 @@ class _Sections:
             self.problem((*path, type_key), message)
             return None
         own = {key: value for key, value in section.items() if key != type_key}
+        own, changes = brought_up_to_date(own, path, entry.settings)
+        for former, said in changes.items():
+            tell(str(Problem(self.document.where(former), former, said)))
         settings = self.validate(entry.settings, own, path, (type_key, *beside))
         return None if settings is None else Component(name, entry.cls, settings)
 

@@ -1,0 +1,84 @@
+"""Run files and saved policies of before still work; what became of their keys is said."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from envs.grasp.observations import observation_space
+from envs.grasp.settings import GraspSettings
+from trainers.evaluate import main as evaluate
+from trainers.export import main as export
+from trainers.inference.policy import Policy
+from trainers.runfile.registry import Registries
+from trainers.runfile.settings import load_run
+from trainers.runfile.yaml_document import dump, read
+
+POLICY = Path(__file__).parents[2] / "policies" / "grasp"
+PRESENT = ("motion", "standoff_m", "contact_resolution_m")
+
+
+@pytest.fixture
+def former_policy(tmp_path: Path) -> Path:
+    """The shipped policy as it was saved before motions had legs, and policies said their spaces.
+
+    What its resolved run file had then is written out in it.
+    """
+    folder = tmp_path / "former"
+    shutil.copytree(POLICY, folder)
+    (folder / "policy.json").unlink()
+    run = read(folder / "configuration.yaml").data
+    environment = {k: v for k, v in run["environment"].items() if k not in PRESENT}
+    environment["motion_checks"] = 4
+    environment["pick"] = {
+        **{k: v for k, v in environment["pick"].items() if k != "approach_s"},
+        **{"standoff_m": 0.08, "standoff_s": 0.25},
+    }
+    run = {**run, "environment": environment}
+    run.pop("evaluation", None)
+    (folder / "configuration.yaml").write_text(dump(run))
+    return folder
+
+
+def test_its_settings_are_those_of_now(
+    former_policy: Path, registries: Registries, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = former_policy / "configuration.yaml"
+    settings = load_run(file, [], registries).environment.settings
+    assert isinstance(settings, GraspSettings)
+    assert (settings.standoff_m, settings.pick.approach_s) == (0.08, 0.25)
+    assert settings.motion == "standoff"
+    for key, said in {
+        "motion_checks": "passed over: contacts are looked for all along a motion",
+        "pick.standoff_m": "read as environment.standoff_m",
+        "pick.standoff_s": "read as environment.pick.approach_s",
+    }.items():
+        (line,) = [text for text in caplog.messages if f"environment.{key}: {said}" in text]
+        assert line.startswith(f"{file}:")
+
+
+def test_critics_of_before_see_the_limits_that_they_were_trained_with() -> None:
+    assert observation_space(GraspSettings(privileged=True))["privileged"].shape == (22,)
+
+
+def test_an_override_of_the_present_name_holds(former_policy: Path, registries: Registries) -> None:
+    overrides = ["environment.standoff_m=0.05", "environment.motion_checks=100"]
+    run = load_run(former_policy / "configuration.yaml", overrides, registries)
+    assert isinstance(run.environment.settings, GraspSettings)
+    assert run.environment.settings.standoff_m == 0.05
+
+
+def test_it_is_evaluated_exported_and_loaded(
+    former_policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate([str(former_policy), "--episodes", "4", "environment.workers=0"]) == 0
+    exported = tmp_path / "exported"
+    assert export([str(former_policy), str(exported)]) == 0
+    assert "error" not in capsys.readouterr().err
+    policies = [Policy.load(folder) for folder in (POLICY, former_policy, exported)]
+    image = policies[0].observation_space["depth"].sample()
+    actions = [policy.predict({"depth": image})[0] for policy in policies]
+    np.testing.assert_array_equal(actions[1:], [actions[0]] * 2)
