@@ -80,6 +80,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "overrides",
         nargs="*",
+        default=[],
         metavar="KEY=VALUE",
         help="a dotted path into the run's file, such as environment.num_envs=16",
     )
@@ -195,20 +196,27 @@ def _write(path: Path, report: dict[str, Any]) -> None:
     try:
         write_atomically(path, json.dumps(report, indent=2) + "\n")
     except OSError as error:
-        raise UserError(f"{path}: can't be written: {error.strerror}") from error
+        raise UserError(f"{path}: {error.strerror}") from error
 
 
 def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value} is less than 1")
-    return value
+    return _whole_number(text, 1)
 
 
 def _seed(text: str) -> int:
-    value = int(text)
-    if not 0 <= value < SEED_LIMIT:
-        raise argparse.ArgumentTypeError(f"{value} is not from 0 to {SEED_LIMIT - 1}")
+    return _whole_number(text, 0)
+
+
+def _whole_number(text: str, least: int) -> int:
+    """Raises: argparse.ArgumentTypeError: it is none, or not within its limits."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = least - 1
+    if not least <= value < SEED_LIMIT:
+        raise argparse.ArgumentTypeError(
+            f"should be a whole number from {least} to {SEED_LIMIT - 1}, not {text!r}"
+        )
     return value
 
 

@@ -16,6 +16,7 @@ from envs.evaluation import EvaluationReport, Figure, PhysicalCheck
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import EpisodeBatch, concatenate
+from trainers.inference.metadata import read_metadata
 from trainers.inference.policy import Policy
 from trainers.reporting.figures import (
     Metrics,
@@ -125,10 +126,13 @@ def find_run(policy: str, overrides: Sequence[str], results_dir: Path) -> tuple[
     """Folder and settings of the run a saved policy comes from; its weights are not read.
 
     Raises:
-        UserError: there is no such policy, or its configuration is not valid.
+        UserError: there is no such policy, a plugin that it needs is not installed here, or its
+            configuration is not valid.
     """
-    folder = find_run_folder(policy, results_dir)
-    return folder, load_run(folder / CONFIGURATION, overrides, load_registries())
+    folder, registries = find_run_folder(policy, results_dir), load_registries()
+    if metadata := read_metadata(folder):
+        metadata.check_plugins(registries, folder)
+    return folder, load_run(folder / CONFIGURATION, overrides, registries)
 
 
 def _check_spaces(policy: Policy, env: Environment) -> None:

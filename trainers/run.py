@@ -28,7 +28,6 @@ from trainers.saving.run_folder import (
     begin,
     check,
     find_checkpoint,
-    run_folder,
 )
 from trainers.session import Session
 from trainers.training import Ending, Training
@@ -159,21 +158,22 @@ def _start(
         except EnvironmentFailure:
             raise
         except (RuntimeError, ValueError, KeyError) as error:
+            run = checkpoints.directory.parent
             raise UserError(
                 f"{loaded.path}: the run can't go on from here: {_first_line(error)}. --resume "
                 "needs the run file, and the version of ventosa, that the run began with; to begin "
-                f"another run with its weights, use --initialize-from {run_folder(loaded.path)}"
+                f"another run with its weights, use --initialize-from {run}"
             ) from error
         return loaded
     if options.initialize_from:
-        loaded = find_checkpoint(options.initialize_from, options.results_dir)
+        weights = find_checkpoint(options.initialize_from, options.results_dir).weights
         try:
-            session.algorithm.policy.load_state_dict(loaded.weights)
+            session.algorithm.policy.load_state_dict(weights)
         except RuntimeError as error:
             raise UserError(
                 f"--initialize-from {options.initialize_from}: these weights do not fit the run "
-                f"file's networks: {_first_line(error)}. They are for the observations and "
-                f"networks of {run_folder(loaded.path) / CONFIGURATION}"
+                f"file's networks: {_first_line(error)}. The {CONFIGURATION} that they "
+                "came with has the observations and the networks that they are for"
             ) from error
     session.reset()
     return None

@@ -99,6 +99,5 @@ def _check_equal(path: str, found: Iterable[str], expected: Iterable[str]) -> No
     if differing := sorted(set(found) ^ set(expected)):
         raise ValueError(
             f"the saved episodes are of another version of the grasp task: {path} differs in "
-            f"{', '.join(differing)}; begin new ones, from the run's weights, with "
-            "--initialize-from"
+            f"{', '.join(differing)}"
         )

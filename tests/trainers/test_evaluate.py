@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,44 @@ def test_what_an_environment_can_not_show_is_told(evaluate: Callable[..., Any]) 
     assert code == 2
     assert errors == "error: --render: the environment has no pictures to show\n"
     assert not (results / "toy" / "evaluation").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "limits"),
+    [
+        ("--episodes", "0", "1 to"),
+        ("--episodes", "x", "1 to"),
+        ("--seed", "-1", "0 to"),
+        ("--seed", str(2**31), f"0 to {2**31 - 1}"),
+    ],
+)
+def test_counts_and_seeds_are_whole_numbers_within_limits(
+    capsys: pytest.CaptureFixture[str], option: str, value: str, limits: str
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["policies/grasp", option, value])
+    assert stop.value.code == 2
+    said = capsys.readouterr().err
+    assert f"{option}: should be a whole number from {limits}" in said
+    assert f"not '{value}'" in said
+
+
+def test_nothing_but_the_policy_is_required(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main([])
+    assert capsys.readouterr().err.endswith("are required: policy\n")
+
+
+def test_a_plugin_that_is_not_installed_is_named_with_its_distribution(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "theirs"
+    shutil.copytree(Path(__file__).parents[2] / "policies" / "grasp", folder)
+    path = folder / "policy.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, "trainer": {"name": "sac", "distribution": "theirs"}}))
+    assert main([str(folder)]) == 2
+    assert "needs the trainer 'sac' of theirs, which is not installed" in capsys.readouterr().err
 
 
 class TestAThirdPartysEnvironment:

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from encoders.saved_spaces import space_from_plain, space_to_plain
 from envs.environment import Environment
 from trainers.common.errors import UserError
 from trainers.runfile.registry import Entry, Registries
 from trainers.runfile.settings import RunSettings
+from trainers.runfile.yaml_document import dotted
 
 FILE = "policy.json"
 FORMAT = 1
@@ -131,10 +132,17 @@ def read_metadata(folder: Path) -> Metadata | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        first = str(error).splitlines()[0]
         raise UserError(
-            f"{folder / FILE}: can't be used: {first}; export the policy anew"
+            f"{folder / FILE}: can't be used: {_reason(error)}; export the policy anew"
         ) from error
+
+
+def _reason(error: Exception) -> str:
+    """In a line: of several things that don't fit, the first."""
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        return ": ".join(filter(None, (dotted(first["loc"]), first["msg"])))
+    return str(error).splitlines()[0]
 
 
 def _need(name: str, entry: Entry) -> Need:

@@ -120,6 +120,16 @@ def _find(name: str, results_dir: Path) -> Path:
 
 
 def run_folder(checkpoint: Path) -> Path:
-    """The folder of the run a checkpoint belongs to; an exported policy brings its own."""
-    folder = checkpoint.resolve()
-    return folder if (folder / CONFIGURATION).is_file() else folder.parents[1]
+    """The folder of the run a checkpoint belongs to; an exported policy brings its own.
+
+    Raises:
+        UserError: there is no run file, neither with the policy nor where the run would be.
+    """
+    own = checkpoint.resolve()
+    for folder in (own, own.parents[1]):
+        if (folder / CONFIGURATION).is_file():
+            return folder
+    raise UserError(
+        f"{checkpoint}: its {CONFIGURATION} is not there, which says what the policy is made of: "
+        "name a run, a checkpoint where the run left it, or an exported policy"
+    )

@@ -241,12 +241,27 @@ def test_a_plugin_that_is_not_installed_is_named(saved: Save) -> None:
         Policy.load(folder)
 
 
-@pytest.mark.parametrize("content", ["", "{}", '{"format": 2}', "[1]"])
-def test_damaged_metadata_are_refused(saved: Save, content: str) -> None:
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("", "Invalid JSON"),
+        ("{}", "format: "),
+        ('{"format": 2}', "observation_space: "),
+        ("[1]", ""),
+    ],
+)
+def test_damaged_metadata_are_refused(saved: Save, content: str, reason: str) -> None:
     folder, _ = saved()
     (folder / FILE).write_text(content)
-    with pytest.raises(UserError, match=r"policy\.json: can't be used"):
+    with pytest.raises(UserError, match=rf"policy\.json: can't be used: {reason}.*; export"):
         Policy.load(folder)
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:99"])
+def test_a_device_that_is_not_there_is_named(saved: Save, device: str) -> None:
+    folder, _ = saved()
+    with pytest.raises(UserError, match=f"device: '{device}' can't be used: .*; use 'cpu'"):
+        Policy.load(folder, device=device)
 
 
 def test_the_shipped_policy_needs_neither_environment_nor_optimizer() -> None:

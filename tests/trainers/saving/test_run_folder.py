@@ -82,6 +82,7 @@ def test_a_folder_that_can_not_be_made_is_the_users_mistake(
 def test_checkpoints_are_found_by_run_id_by_run_and_by_their_own_path(tmp_path: Path) -> None:
     run = tmp_path / "results/first"
     best, latest = save(run, 100, 2.0), save(run, 200, 1.0)
+    (run / CONFIGURATION).touch()
     for name, step in (("first", 100), (str(run), 100), (str(best), 100), (str(latest), 200)):
         found = find_checkpoint(name, tmp_path / "results")
         assert found.step == step
@@ -89,6 +90,12 @@ def test_checkpoints_are_found_by_run_id_by_run_and_by_their_own_path(tmp_path: 
         assert found.state is None
         assert run_folder(found.path) == run
         assert find_run_folder(name, tmp_path / "results").resolve() == run
+
+
+def test_a_checkpoint_that_was_moved_out_of_its_run_lacks_its_run_file(tmp_path: Path) -> None:
+    moved = save(tmp_path / "results/first", 100, 2.0).rename(tmp_path / "moved")
+    with pytest.raises(UserError, match=r"moved: its configuration\.yaml is not there.*left it"):
+        run_folder(moved)
 
 
 def test_a_name_that_leads_nowhere_is_the_users_mistake(tmp_path: Path) -> None:
