@@ -272,13 +272,6 @@ def test_a_breakdown_is_told_without_a_traceback(
     assert evaluate("target")[:2] == (1, told)
 
 
-@pytest.mark.parametrize("seed", ["-1", str(2**31)])
-def test_a_seed_out_of_range_is_refused(capsys: pytest.CaptureFixture[str], seed: str) -> None:
-    with pytest.raises(SystemExit):
-        main(["nowhere", f"--seed={seed}"])
-    assert f"{seed} is not from 0 to 2147483647" in capsys.readouterr().err
-
-
 def test_a_policy_that_is_not_there_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["nowhere", "--throw"]) == 2
     assert "nowhere: neither a run nor a checkpoint" in capsys.readouterr().err
