@@ -297,7 +297,7 @@ def test_an_exported_policy_acts_and_names_the_plugin_where_that_is_missing(
     assert not np.array_equal(best, drawn)
     np.testing.assert_array_equal(best, policy.predict(goals)[0])
     without = [path for path in sys.path if not list(Path(path).glob("ventosa_sac_plugin*"))]
-    assert len(without) == len(sys.path) - 1
+    assert len(without) < len(sys.path)
     monkeypatch.setattr(sys, "path", without)
     with pytest.raises(
         UserError, match=r"needs the trainer 'sac' of ventosa-sac-plugin 0\.1\.0, which is not"
