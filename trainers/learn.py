@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import os
 import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+
+from trainers.common import process
 
 DONE, FAILED, MISTAKE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 PACKAGES = ("trainers", "envs", "encoders", "rewards", "curricula")
@@ -22,8 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if shadowed := shadowed_packages():
         print(f"error: {shadowed}", file=sys.stderr)
         return MISTAKE
-    # torch's threads would otherwise spin while they wait, on the cores that simulate.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    process.prepare()
     # Imported late, so that `--help` and a mistyped option answer at once.
     from envs.environment import EnvironmentFailure  # noqa: PLC0415
     from trainers.common.errors import UserError  # noqa: PLC0415

@@ -13,13 +13,13 @@ exit code is 1 if that is a ratio to a peer; speeds alone move with whatever els
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
 from benchmarks.command import INSTALL, missing, require, tells_mistakes
+from trainers.common import process
 
 PARTS = ("simulator", "environment", "training", "memory")
 SIZES = (32, 80, 128, 256)
@@ -31,8 +31,7 @@ MIN_ENVS = 16
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, and prints tables or tracks a history."""
     options = parse(arguments)
-    # As `trainers.learn` has it, and before torch is imported: idle threads wait, and don't spin.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    process.prepare()  # as `trainers.learn` does, and before torch is imported
     from benchmarks.speed.parts import PARTS as MEASURES  # noqa: PLC0415
     from benchmarks.speed.track import track  # noqa: PLC0415
     from benchmarks.speed.training import PEER_PACKAGES  # noqa: PLC0415

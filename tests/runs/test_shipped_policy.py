@@ -13,7 +13,7 @@ POLICY = Path(__file__).parents[2] / "policies" / "grasp"
 LARGEST_BYTES = 10_000_000
 
 
-def test_the_shipped_policy_has_the_figures_of_its_evaluation() -> None:
+def test_the_shipped_policy_has_the_figures_of_its_evaluation_at_half_the_resolution_too() -> None:
     told = json.loads((POLICY / "evaluation.json").read_text())
     assert told["episodes"] == 1000
     found = evaluate(str(POLICY), episodes=512, seed=7).report
@@ -23,6 +23,11 @@ def test_the_shipped_policy_has_the_figures_of_its_evaluation() -> None:
     median_m = found["position_error_m"]["median"]
     assert median_m == pytest.approx(told["position_error_m"]["median"], rel=0.15)
     assert max(found["collision_rate"], found["first_action_collision_rate"]) < 0.01
+    finer = evaluate(
+        str(POLICY), episodes=512, seed=7, overrides=["environment.contact_resolution_m=0.0025"]
+    ).report
+    for rate in ("collision_rate", "first_action_collision_rate"):
+        assert finer[rate] == pytest.approx(found[rate], abs=0.002)
 
 
 def test_the_shipped_weights_are_small() -> None:

@@ -1,0 +1,26 @@
+"""Settings of the process that training runs in, made before torch is imported."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+
+# glibc's names in malloc.h, and the highest threshold that it takes.
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+LARGEST_MMAP_THRESHOLD = 32 * 2**20
+KEPT_BYTES = 2**31 - 1
+
+
+def prepare() -> None:
+    """Lets idle threads sleep, and freed memory stay with the process.
+
+    torch's threads would otherwise spin while they wait, on the cores that simulate. And the
+    activations of a batch, some ten megabytes each, are freed and taken again in every optimizer
+    step: where glibc gives them back to the system in between, every page of them is mapped and
+    zeroed anew, which can cost a third of an update. Other C libraries are left alone.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(M_MMAP_THRESHOLD, LARGEST_MMAP_THRESHOLD)
+        mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)
