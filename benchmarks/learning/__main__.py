@@ -28,8 +28,8 @@ from trainers.runfile.registry import load_registries
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains what is missing, and reports on all."""
     options = parse(arguments)
-    require("stable_baselines3", "sb3_contrib", "scipy", "mujoco", "matplotlib")
     algorithms = trainable(options.algorithms)
+    require("scipy", "matplotlib")
     # Side by side with its peer, so that both meet the same moods of the machine.
     jobs = [
         _job(Entry(case, side, seed), options.results)
@@ -38,6 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for seed in options.seeds or range(case.seeds)
         for side in SIDES
     ]
+    if not all(job.results.exists() for job in jobs):
+        require("stable_baselines3", "sb3_contrib", "mujoco")
     return run_missing(jobs, options.jobs) or report(options, jobs)
 
 
