@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.environment import Environment
-from envs.evaluation import EvaluationReport, Figure, PhysicalCheck
+from envs.evaluation import EvaluationReport, Evaluator, Figure, PhysicalCheck
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import EpisodeBatch, concatenate
@@ -239,14 +239,17 @@ def evaluate_policy(
         first_seed + WHOLE_EPISODE,
         deterministic=not evaluator.judges_first_action,
     )
+    whole = _episode_report(evaluator, played)
+    return {"episodes": episodes, "seed": seed, **whole, **first}
+
+
+def _episode_report(evaluator: Evaluator, played: EpisodeBatch) -> dict[str, Any]:
+    """Figures and rewards of whole episodes."""
     return {
-        "episodes": episodes,
-        "seed": seed,
         **summaries(episode_figures(evaluator), played.episode_metrics),
         "reward": float(played.rewards.mean()),
         "reward_std": float(played.rewards.std()),
         "episode_length": float(played.lengths.mean()),
-        **first,
     }
 
 
