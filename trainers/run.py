@@ -10,7 +10,7 @@ from pathlib import Path
 
 from envs.environment import EnvironmentFailure
 from trainers.algorithms.base import TrainerSettings
-from trainers.common.errors import UserError
+from trainers.common.errors import UserError, first_lines
 from trainers.common.files import write_atomically
 from trainers.common.timers import Timer, recording
 from trainers.experience.env_runner import NonFiniteError, StopRequested
@@ -160,7 +160,7 @@ def _start(
         except (RuntimeError, ValueError, KeyError) as error:
             run = checkpoints.directory.parent
             raise UserError(
-                f"{loaded.path}: the run can't go on from here: {_first_line(error)}. --resume "
+                f"{loaded.path}: the run can't go on from here: {first_lines(error, 2)}. --resume "
                 "needs the run file, and the version of ventosa, that the run began with; to begin "
                 f"another run with its weights, use --initialize-from {run}"
             ) from error
@@ -172,7 +172,7 @@ def _start(
         except RuntimeError as error:
             raise UserError(
                 f"--initialize-from {options.initialize_from}: these weights do not fit the run "
-                f"file's networks: {_first_line(error)}. The {CONFIGURATION} that they "
+                f"file's networks: {first_lines(error, 2)}. The {CONFIGURATION} that they "
                 "came with has the observations and the networks that they are for"
             ) from error
     session.reset()
@@ -187,8 +187,3 @@ def _flags(options: argparse.Namespace) -> list[str]:
         "device": options.device,
     }
     return [f"{key}={value}" for key, value in flags.items() if value is not None]
-
-
-def _first_line(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return " ".join(lines[:2]).rstrip(".")

@@ -17,3 +17,9 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     if close:
         return "did you mean " + " or ".join(f"'{match}'" for match in close) + "?"
     return f"known: {', '.join(names)}" if names else "none is known"
+
+
+def first_lines(error: Exception, count: int) -> str:
+    """The first so many lines of a message that goes on for many, such as torch's, in one line."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return " ".join(lines[:count]).rstrip(".")

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from envs.environment import Environment
 from trainers.common.devices import resolve_device
-from trainers.common.errors import UserError
+from trainers.common.errors import UserError, first_lines
 from trainers.inference.construction import network_factory
 from trainers.inference.inputs import checked
 from trainers.inference.metadata import Metadata, read_metadata
@@ -184,8 +184,8 @@ def _network(loaded: Loaded, folder: Path, metadata: Metadata) -> PolicyNetwork:
     try:
         network.load_state_dict(loaded.weights)
     except RuntimeError as error:
-        reason = " ".join(line.strip() for line in str(error).splitlines()[:3])
         raise UserError(
-            f"{loaded.path}: these weights do not fit the networks of its {CONFIGURATION}: {reason}"
+            f"{loaded.path}: these weights do not fit the networks of its {CONFIGURATION}: "
+            f"{first_lines(error, 3)}"
         ) from error
     return network
