@@ -158,18 +158,15 @@ class Keypoints(nn.Module):
 def _known_camera(space: Box) -> DepthImage:
     if not isinstance(space, DepthImage):
         raise ValueError("only depth images (encoders.spaces.DepthImage) can be turned into points")
-    if space.focal_length_px is None:
+    if space.pinhole is None:
         raise ValueError(
-            "the depth image does not know its camera: declare its DepthImage with focal_length_px"
+            "the depth image does not know its camera: declare its DepthImage with a pinhole"
         )
     return space
 
 
 def _rays(space: DepthImage) -> torch.Tensor:
     """(3, H, W) the points at depth 1 that pixels' centres see: x right, y down, z forward."""
-    assert space.focal_length_px is not None
+    assert space.pinhole is not None
     height, width, _ = space.shape
-    rows = (torch.arange(height) + 0.5 - height / 2) / space.focal_length_px
-    columns = (torch.arange(width) + 0.5 - width / 2) / space.focal_length_px
-    y, x = torch.meshgrid(rows, columns, indexing="ij")
-    return torch.stack([x, y, torch.ones_like(x)])
+    return torch.from_numpy(space.pinhole.rays(height, width)).float().permute(2, 0, 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import gymnasium
@@ -9,6 +10,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
+from encoders.cameras import Pinhole, Sampling
 from encoders.spaces import DepthImage, RgbImage
 
 Plain = dict[str, Any]
@@ -34,10 +36,16 @@ def space_to_plain(space: gymnasium.Space[Any]) -> Plain:
                 "width": width,
                 "range_m": list(space.range_m),
                 "encoding": space.encoding,
-                "focal_length_px": space.focal_length_px,
+                "pinhole": _fields(space.pinhole),
+                "sampling": _fields(space.sampling),
             }
         case RgbImage():
-            return {"type": "rgb_image", "height": space.shape[0], "width": space.shape[1]}
+            return {
+                "type": "rgb_image",
+                "height": space.shape[0],
+                "width": space.shape[1],
+                "sampling": _fields(space.sampling),
+            }
         case Box():
             return {
                 "type": "box",
@@ -66,14 +74,32 @@ def space_from_plain(plain: Plain) -> gymnasium.Space[Any]:
         case "discrete":
             return Discrete(fields["n"], start=fields["start"])
         case "depth_image":
-            return DepthImage(**{**fields, "range_m": tuple(fields["range_m"])})
+            return _depth_image(fields)
         case "rgb_image":
-            return RgbImage(**fields)
+            return RgbImage(**{**fields, "sampling": _sampling(fields.get("sampling"))})
         case "box":
             dtype, shape = np.dtype(fields["dtype"]), tuple(fields["shape"])
             low, high = (_bound_from_plain(fields[key], dtype, shape) for key in ("low", "high"))
             return Box(low, high, dtype=dtype.type)
     raise ValueError(f"a space of the unknown type {plain['type']!r}")
+
+
+def _fields(geometry: Pinhole | Sampling | None) -> Plain | None:
+    return None if geometry is None else asdict(geometry)
+
+
+def _sampling(fields: Plain | None) -> Sampling | None:
+    return None if fields is None else Sampling(**fields)
+
+
+def _depth_image(fields: Plain) -> DepthImage:
+    pinhole = fields.get("pinhole") and Pinhole(**fields["pinhole"])
+    # Of policies from before cameras had a centre: square pixels, and the axis in the middle.
+    if focal_px := fields.pop("focal_length_px", None):
+        pinhole = Pinhole(focal_px, focal_px, fields["width"] / 2, fields["height"] / 2)
+    sampling = _sampling(fields.get("sampling"))
+    known = {"range_m": tuple(fields["range_m"]), "pinhole": pinhole, "sampling": sampling}
+    return DepthImage(**{**fields, **known})
 
 
 def _bound_to_plain(bound: NDArray[Any]) -> Any:

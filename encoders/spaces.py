@@ -9,6 +9,8 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from encoders.cameras import Pinhole, Sampling
+
 if TYPE_CHECKING:
     import torch
 
@@ -42,8 +44,8 @@ class DepthImage(Box):
         width: Columns of the image.
         range_m: Nearest and farthest depth of the camera, in metres.
         encoding: What one number of the image stands for.
-        focal_length_px: Of the pinhole camera, whose axis goes through the image's middle, for
-            encoders that need to know it; None where it is unknown.
+        pinhole: The camera, for encoders that need to know it; None where it is unknown.
+        sampling: Which of a sensor's pixels these are; None: all of them.
 
     Attributes:
         codes: First and last of those that stand for a depth in the range.
@@ -60,7 +62,8 @@ class DepthImage(Box):
         width: int,
         range_m: tuple[float, float] = (0.4, 2.0),
         encoding: DepthEncoding = "uint16",
-        focal_length_px: float | None = None,
+        pinhole: Pinhole | None = None,
+        sampling: Sampling | None = None,
     ) -> None:
         if encoding not in ("uint8", "uint16"):
             raise ValueError(f"depth encoding {encoding!r} is unknown: use 'uint16' or 'uint8'")
@@ -75,15 +78,12 @@ class DepthImage(Box):
                 f"a depth of {max_m} m does not fit in uint16 millimetres, which end at "
                 f"{UINT16_MAX / MM_PER_M} m: lower the range's end or use the encoding 'uint8'"
             )
-        if focal_length_px is not None and not 0 < focal_length_px < np.inf:
-            raise ValueError(
-                f"a focal length of {focal_length_px} pixels must be finite and over 0"
-            )
+        _check_sampling(height, width, sampling)
         top, dtype = (UINT8_MAX, np.uint8) if encoding == "uint8" else (UINT16_MAX, np.uint16)
         super().__init__(0, top, shape=(height, width, 1), dtype=dtype)
         self.range_m = (min_m, max_m)
         self.encoding = encoding
-        self.focal_length_px = focal_length_px
+        self.pinhole, self.sampling = pinhole, sampling
         self.zero_m = min_m if encoding == "uint8" else 0.0
         self.codes_per_m = UINT8_MAX / (max_m - min_m) if encoding == "uint8" else float(MM_PER_M)
         low, high = ((end - self.zero_m) * self.codes_per_m for end in self.range_m)
@@ -177,15 +177,16 @@ class DepthImage(Box):
     def __repr__(self) -> str:
         """Says what the numbers mean, where a Box would list its bounds."""
         height, width, _ = self.shape
-        camera = "" if self.focal_length_px is None else f", focal_length_px={self.focal_length_px}"
+        known = {"pinhole": self.pinhole, "sampling": self.sampling}
+        rest = "".join(f", {name}={value}" for name, value in known.items() if value is not None)
         return (
             f"DepthImage({height}, {width}, range_m={self.range_m}, encoding={self.encoding!r}"
-            f"{camera})"
+            f"{rest})"
         )
 
     @property
-    def _key(self) -> tuple[tuple[float, float], str, float | None]:
-        return self.range_m, self.encoding, self.focal_length_px
+    def _key(self) -> tuple[tuple[float, float], str, Pinhole | None, Sampling | None]:
+        return self.range_m, self.encoding, self.pinhole, self.sampling
 
 
 class RgbImage(Box):
@@ -194,22 +195,35 @@ class RgbImage(Box):
     Args:
         height: Rows of the image.
         width: Columns of the image.
+        sampling: Which of a sensor's pixels these are; None: all of them.
 
     Raises:
         ValueError: The size makes no sense.
     """
 
-    def __init__(self, height: int, width: int) -> None:
+    def __init__(self, height: int, width: int, sampling: Sampling | None = None) -> None:
         _check_size(height, width)
+        _check_sampling(height, width, sampling)
         super().__init__(0, UINT8_MAX, shape=(height, width, 3), dtype=np.uint8)
+        self.sampling = sampling
 
     def picture(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Draws one image (height, width, 3) for people: as it is."""
         return frame
 
+    def __eq__(self, other: Any) -> bool:
+        """Two are equal when they are the same pixels of a sensor, too."""
+        same = isinstance(other, RgbImage) and super().__eq__(other)
+        return same and self.sampling == other.sampling
+
+    def __hash__(self) -> int:
+        """Agrees with equality."""
+        return hash((self.shape, self.sampling))
+
     def __repr__(self) -> str:
         """Gives the size; everything else is fixed."""
-        return f"RgbImage({self.shape[0]}, {self.shape[1]})"
+        rest = "" if self.sampling is None else f", sampling={self.sampling}"
+        return f"RgbImage({self.shape[0]}, {self.shape[1]}{rest})"
 
 
 def _check_size(height: int, width: int) -> None:
@@ -217,3 +231,8 @@ def _check_size(height: int, width: int) -> None:
         raise ValueError(
             f"an image needs at least one pixel, not {width}x{height} (width x height)"
         )
+
+
+def _check_sampling(height: int, width: int, sampling: Sampling | None) -> None:
+    if sampling is not None and (sampling.height, sampling.width) != (height, width):
+        raise ValueError(f"{sampling} takes another size than {width}x{height} (width x height)")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage, RgbImage
 from envs.grasp.episode_state import RunningEpisodes
-from envs.grasp.sensors.camera import focal_length_px
+from envs.grasp.sensors.camera import pinhole, sampling
 from envs.grasp.settings import GraspSettings
 
 PRIVILEGED = "privileged"
@@ -25,16 +25,14 @@ def observation_space(settings: GraspSettings) -> gymnasium.spaces.Dict:
     """The space of one environment's observations."""
     spaces: dict[str, gymnasium.Space[Any]] = {}
     for name, camera in settings.cameras.items():
+        sampled = sampling(camera)
+        shape = (sampled.height, sampled.width)
         if camera.type == "depth":
             spaces[name] = DepthImage(
-                camera.height,
-                camera.width,
-                camera.range_m,
-                camera.encoding,
-                focal_length_px(camera),
+                *shape, camera.range_m, camera.encoding, pinhole(camera), sampled
             )
         else:
-            spaces[name] = RgbImage(camera.height, camera.width)
+            spaces[name] = RgbImage(*shape, sampled)
     if settings.privileged:
         size = POSES_AND_PROGRESS + (LIMITS if settings.privileged_limits else 0)
         spaces[PRIVILEGED] = Box(-np.inf, np.inf, (size,), np.float32)

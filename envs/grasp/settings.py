@@ -10,6 +10,8 @@ from pydantic import (
     BaseModel,
     Field,
     FiniteFloat,
+    NonNegativeInt,
+    PositiveInt,
     field_validator,
     model_validator,
 )
@@ -51,14 +53,48 @@ def check_resolution(resolution_m: float) -> float:
     return resolution_m
 
 
+class Intrinsics(BaseModel, frozen=True, extra="forbid"):
+    """A pinhole camera, in pixels of the sensor; the first pixel's centre is at (0.5, 0.5)."""
+
+    fx: float = Field(gt=0.0, allow_inf_nan=False, description="Focal length over a pixel's width.")
+    fy: float = Field(
+        gt=0.0, allow_inf_nan=False, description="Focal length over a pixel's height."
+    )
+    cx: FiniteFloat = Field(description="Column coordinate of the optical axis.")
+    cy: FiniteFloat = Field(description="Row coordinate of the optical axis.")
+
+
+class SamplingSettings(BaseModel, frozen=True, extra="forbid"):
+    """Which of the sensor's pixels the network sees; part of the policy."""
+
+    crop: tuple[NonNegativeInt, NonNegativeInt, PositiveInt, PositiveInt] | None = Field(
+        None,
+        description="[left, top, width, height] in sensor pixels; null: the whole image.",
+    )
+    every: PositiveInt = Field(
+        1, description="Of the crop's columns and rows every so manyth is taken, from the first on."
+    )
+
+
+FieldOfView = Annotated[float, Field(gt=1.0, lt=170.0)]
+
+
 class Camera(BaseModel, frozen=True, extra="forbid"):
-    """A pinhole camera with square pixels, sampled at pixel centres."""
+    """A pinhole camera, sampled at pixel centres."""
 
     type: Literal["depth", "rgb"] = Field(description="What the camera measures.")
-    width: int = Field(80, ge=1, le=4096, description="Image width in pixels.")
-    height: int = Field(80, ge=1, le=4096, description="Image height in pixels.")
-    fov_deg: float = Field(
-        44.0, gt=1.0, lt=170.0, description="Horizontal field of view in degrees."
+    width: int = Field(80, ge=1, le=4096, description="Width of the sensor in pixels.")
+    height: int = Field(80, ge=1, le=4096, description="Height of the sensor in pixels.")
+    fov_deg: FieldOfView | tuple[FieldOfView, FieldOfView] = Field(
+        44.0,
+        description="Field of view of the sensor in degrees: horizontal, where pixels are square; "
+        "or [horizontal, vertical]. The optical axis goes through the middle.",
+    )
+    intrinsics: Intrinsics | None = Field(
+        None, description="The camera as it was calibrated, in place of fov_deg."
+    )
+    sampling: SamplingSettings = Field(
+        SamplingSettings(), description="Which of the sensor's pixels the network sees."
     )
     position_m: Point = Field((0.36, 0.25, 0.95), description="Optical centre, world frame.")
     target_m: Point = Field((1.10, 0.0, 0.75), description="The point it looks at, world frame.")
@@ -89,6 +125,14 @@ class Camera(BaseModel, frozen=True, extra="forbid"):
     def _is_possible(self) -> Camera:
         if self.position_m == self.target_m:
             raise ValueError("position_m and target_m are the same point: the camera looks nowhere")
+        if self.intrinsics is not None and "fov_deg" in self.model_fields_set:
+            raise ValueError("intrinsics and fov_deg say the same thing: leave one of them out")
+        left, top, width, height = self.sampling.crop or (0, 0, self.width, self.height)
+        if left + width > self.width or top + height > self.height:
+            raise ValueError(
+                f"sampling.crop {[left, top, width, height]} leaves the sensor, which has "
+                f"{self.width}x{self.height} pixels (width x height)"
+            )
         if self.near_m[0] <= 0.0 or self.near_m[1] >= self.far_m[0]:
             raise ValueError(
                 f"near_m {list(self.near_m)} must be over 0 and lie before far_m {list(self.far_m)}"

@@ -7,6 +7,7 @@ from pydantic import BaseModel, ValidationError
 from torch import nn
 
 from encoders import plugin
+from encoders.cameras import Pinhole
 from encoders.spaces import DepthImage
 from trainers import hookspecs
 
@@ -45,7 +46,8 @@ def test_contract(name):
             setattr(settings, field, 1)
     with pytest.raises(ValidationError, match="extra"):
         encoder.Settings(**required, no_such_setting=1)
-    space = Box(-1, 1, (6,)) if name == "vector" else DepthImage(80, 80, focal_length_px=99.0)
+    pinhole = Pinhole(99.0, 99.0, 40.0, 40.0)
+    space = Box(-1, 1, (6,)) if name == "vector" else DepthImage(80, 80, pinhole=pinhole)
     built = encoder(space, settings)
     assert isinstance(built, nn.Module)
     assert isinstance(built.features_dim, int)

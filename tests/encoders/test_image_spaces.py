@@ -9,6 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from encoders.cameras import Pinhole, Sampling
 from encoders.spaces import DepthImage, RgbImage
 
 
@@ -153,7 +154,9 @@ def test_copies_keep_their_meaning(duplicate):
 def test_spaces_of_other_range_or_encoding_differ():
     assert DepthImage(2, 3) != DepthImage(2, 3, (0.4, 3.0))
     assert DepthImage(2, 3) != DepthImage(2, 3, encoding="uint8")
-    assert DepthImage(2, 3) != DepthImage(2, 3, focal_length_px=5.0)
+    assert DepthImage(2, 3) != DepthImage(2, 3, pinhole=Pinhole(5.0, 5.0, 1.5, 1.0))
+    assert DepthImage(2, 3) != DepthImage(2, 3, sampling=Sampling(4, 4, 0, 0, 3, 2, 1))
+    assert RgbImage(2, 3) != RgbImage(2, 3, Sampling(4, 4, 0, 0, 3, 2, 1))
     assert DepthImage(2, 3) != DepthImage(3, 2)
 
 
@@ -193,8 +196,7 @@ def test_rgb_is_bytes_with_three_channels():
         ({"range_m": (0.4002, 0.4008)}, r"no whole millimetre.*'uint8'"),
         ({"encoding": "uint32"}, "'uint32'.*'uint16'"),
         ({"height": 0}, "3x0"),
-        ({"focal_length_px": 0.0}, "focal length of 0.0 pixels"),
-        ({"focal_length_px": float("inf")}, "focal length of inf pixels"),
+        ({"sampling": Sampling(8, 8, 0, 0, 4, 2, 2)}, "another size than 3x2"),
     ],
 )
 def test_senseless_depth_cameras_are_refused(arguments, message):

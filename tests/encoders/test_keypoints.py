@@ -7,12 +7,14 @@ from gymnasium.spaces import Box
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from encoders.cameras import Pinhole
 from encoders.inputs import fill_gaps
 from encoders.keypoints import Keypoints
 from encoders.spaces import DepthImage, RgbImage
 
 FOCAL_PX = 20.0
-SPACE = DepthImage(16, 24, (0.4, 2.0), focal_length_px=FOCAL_PX)
+PINHOLE = Pinhole(FOCAL_PX, FOCAL_PX, 12.0, 8.0)
+SPACE = DepthImage(16, 24, (0.4, 2.0), pinhole=PINHOLE)
 MIDDLE_M = np.sqrt(0.4 * 2.0)
 
 
@@ -136,7 +138,7 @@ def with_holes(images, missing):
 @pytest.mark.parametrize("encoding", ["uint16", "uint8"])
 @pytest.mark.parametrize("far_m", [1.6, 2.0])
 def test_the_far_end_of_the_range_is_seen_in_both_encodings(encoding, far_m):
-    space = DepthImage(16, 24, (0.4, far_m), encoding, FOCAL_PX)
+    space = DepthImage(16, 24, (0.4, far_m), encoding, PINHOLE)
     depth_m = np.full((1, 16, 24), far_m, np.float32)
     with torch.no_grad():
         depth_m = space.decode_seen(torch.from_numpy(space.encode(depth_m)))[..., 0]
@@ -190,8 +192,8 @@ def test_a_middle_that_can_not_be_filled_in_gets_no_attention():
     [
         (RgbImage(16, 16), "only depth images"),
         (Box(-1, 1, (6,)), "only depth images"),
-        (DepthImage(16, 16), "declare its DepthImage with focal_length_px"),
-        (DepthImage(16, 3, focal_length_px=9.0), "3x16 image .* patch of 4 pixels"),
+        (DepthImage(16, 16), "declare its DepthImage with a pinhole"),
+        (DepthImage(16, 3, pinhole=PINHOLE), "3x16 image .* patch of 4 pixels"),
     ],
 )
 def test_spaces_that_make_no_points_are_refused(space, message):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary
 
+from encoders.cameras import Pinhole, Sampling
 from encoders.saved_spaces import space_from_plain, space_to_plain
 from encoders.spaces import DepthImage, RgbImage
 
@@ -24,9 +25,17 @@ from encoders.spaces import DepthImage, RgbImage
         Box(np.array([-(2**63), 0]), np.array([2**63 - 1, 2**62 + 1]), dtype=np.int64),
         Discrete(5),
         Discrete(3, start=-1),
-        DepthImage(48, 64, (0.4, 2.0), "uint8", 51.2),
+        DepthImage(
+            48,
+            64,
+            (0.4, 2.0),
+            "uint8",
+            Pinhole(51.2, 50.1, 32.5, 23.0),
+            Sampling(640, 480, 1, 2, 64, 48, 9),
+        ),
         DepthImage(48, 64),
         RgbImage(2, 3),
+        RgbImage(2, 3, Sampling(9, 9, 0, 0, 3, 2, 3)),
         Dict({"b": Box(0.0, 1.0, (2,), np.float32), "a": RgbImage(1, 1)}),
         Dict(OrderedDict(b=Box(0.0, 1.0, (2,), np.float32), a=Box(0.0, 1.0, (2,), np.float32))),
     ],
@@ -44,6 +53,13 @@ def test_a_space_comes_back_through_json(space: gymnasium.Space[Any]) -> None:
 def test_equal_bounds_are_written_once() -> None:
     plain = space_to_plain(Box(0, 255, (84, 84, 4), np.uint8))
     assert plain == {"type": "box", "low": 0, "high": 255, "shape": [84, 84, 4], "dtype": "uint8"}
+
+
+def test_a_depth_image_of_before_has_its_axis_in_the_middle() -> None:
+    plain = {"type": "depth_image", "height": 48, "width": 64, "range_m": [0.4, 2.0]}
+    plain |= {"encoding": "uint16", "focal_length_px": 51.2}
+    expected = DepthImage(48, 64, pinhole=Pinhole(51.2, 51.2, 32.0, 24.0))
+    assert space_from_plain(plain) == expected
 
 
 def test_what_can_not_be_written_is_refused() -> None:

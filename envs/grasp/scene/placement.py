@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.grasp.scene.blocks import MAX_BAR_SHARE, MIN_BAR_M, SHAPE_CODES, build_block
-from envs.grasp.sensors.camera import focal_length_px
+from envs.grasp.sensors.camera import sampling
 from envs.grasp.settings import GraspSettings
 from envs.grasp.threefry import uniform
 
@@ -40,7 +40,6 @@ class Rules(NamedTuple):
     workspace_low: Floats
     workspace_high: Floats
     image_px: Floats
-    focal_px: Floats
 
 
 def rules(settings: GraspSettings) -> Rules:
@@ -62,8 +61,7 @@ def rules(settings: GraspSettings) -> Rules:
         support_high_m=np.array([support.x_m[1], support.y_m[1], support.top_m]),
         workspace_low=low + WORKSPACE_MARGIN_M * np.array([1.0, 1.0, 1.0, 0.0]),
         workspace_high=high - WORKSPACE_MARGIN_M * np.array([1.0, 1.0, 1.0, 0.0]),
-        image_px=np.array([[camera.width, camera.height] for camera in cameras], float),
-        focal_px=np.array([focal_length_px(camera) for camera in cameras]),
+        image_px=np.array([[taken.width, taken.height] for taken in map(sampling, cameras)], float),
     )
 
 
@@ -74,6 +72,7 @@ def place_blocks(
     yaw_limit_rad: Floats,
     camera_m: Floats,
     camera_rotation: Floats,
+    intrinsics: Floats,
     box_center_m: Floats,
     box_half_m: Floats,
     position_m: Floats,
@@ -91,6 +90,7 @@ def place_blocks(
         yaw_limit_rad: (n,) narrows the range of the yaw to +- this.
         camera_m: (n, C, 3) the cameras' optical centres.
         camera_rotation: (n, C, 3, 3) the cameras' axes as columns.
+        intrinsics: (n, C, 4) their fx, fy, cx, cy in pixels.
         box_center_m: (n, B, 3, 3) written, as the following are: fields of `Scenes`.
         box_half_m: (n, B, 3, 3).
         position_m: (n, B, 3).
@@ -115,7 +115,13 @@ def place_blocks(
                 yaw_rad[row],
                 target_m[row],
             ) and _seen(
-                rules, size_m, position_m[row], yaw_rad[row], camera_m[row], camera_rotation[row]
+                rules,
+                size_m,
+                position_m[row],
+                yaw_rad[row],
+                camera_m[row],
+                camera_rotation[row],
+                intrinsics[row],
             )
             if found[row]:
                 break
@@ -272,6 +278,7 @@ def _seen(
     yaw_rad: Floats,
     camera_m: Floats,
     camera_rotation: Floats,
+    intrinsics: Floats,
 ) -> bool:
     """Whether every block's face lies inside the image of every camera."""
     corner = np.empty(3)
@@ -293,12 +300,11 @@ def _seen(
                         x += ray * camera_rotation[camera, axis, 0]
                         y += ray * camera_rotation[camera, axis, 1]
                         depth += ray * camera_rotation[camera, axis, 2]
-                    width, rows = rules.image_px[camera]
-                    focal = rules.focal_px[camera]
-                    if (
-                        depth <= 0.0
-                        or abs(x) * focal > depth * width / 2
-                        or abs(y) * focal > depth * rows / 2
-                    ):
+                    if depth <= 0.0:
+                        return False
+                    fx, fy, cx, cy = intrinsics[camera]
+                    u, v = cx + fx * x / depth, cy + fy * y / depth
+                    columns, rows = rules.image_px[camera]
+                    if not (0.0 <= u <= columns and 0.0 <= v <= rows):
                         return False
     return True

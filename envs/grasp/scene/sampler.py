@@ -106,6 +106,7 @@ class SceneSampler:
             yaw_limit_rad,
             np.stack([view.position_m for view in views.values()], axis=1),
             np.stack([view.rotation for view in views.values()], axis=1),
+            np.stack([view.intrinsics for view in views.values()], axis=1),
             scenes.box_center_m,
             scenes.box_half_m,
             scenes.block_position_m,

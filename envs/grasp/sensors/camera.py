@@ -1,17 +1,19 @@
-"""The pinhole camera.
+"""The pinhole camera: which of its sensor's pixels are seen, and where it stands.
 
 Camera axes are OpenCV's: x to the right, y down, z forward; depth is measured along z. Pixel
 (column c, row r) looks along the ray through its centre, (c + 0.5, r + 0.5) from the top left.
+A sampled image is the image of a pinhole camera with fewer pixels, and is rendered as such.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from encoders.cameras import Pinhole, Sampling
 from envs.grasp.batch import Batch
 from envs.grasp.settings import Camera
 
@@ -26,6 +28,7 @@ class CameraPoses(Batch):
         camera: what they have in common.
         position_m: (n, 3) optical centres, world frame.
         rotation: (n, 3, 3) whose columns are the camera's axes in the world frame.
+        intrinsics: (n, 4) fx, fy, cx, cy in pixels of the image as it is sampled.
         near_m, far_m: (n,) clip planes.
         noise_sigma_m: (n,) sigma of a depth camera's noise.
         missing_fraction: (n,) probability that a depth camera misses a pixel.
@@ -34,6 +37,7 @@ class CameraPoses(Batch):
     camera: Camera
     position_m: Floats
     rotation: Floats
+    intrinsics: Floats
     near_m: Floats
     far_m: Floats
     noise_sigma_m: Floats
@@ -53,9 +57,32 @@ OVERVIEW = Camera(
 )
 
 
-def focal_length_px(camera: Camera) -> float:
-    """Focal length in pixels, the same for both axes."""
-    return camera.width / 2.0 / float(np.tan(np.radians(camera.fov_deg) / 2.0))
+def sensor_pinhole(camera: Camera) -> Pinhole:
+    """The camera in pixels of its sensor."""
+    if camera.intrinsics is not None:
+        return Pinhole(**camera.intrinsics.model_dump())
+    across, down = camera.fov_deg if isinstance(camera.fov_deg, tuple) else (camera.fov_deg, None)
+    fx = _focal_length_px(camera.width, across)
+    fy = fx if down is None else _focal_length_px(camera.height, down)
+    return Pinhole(fx, fy, camera.width / 2.0, camera.height / 2.0)
+
+
+def sampling(camera: Camera) -> Sampling:
+    """Which of the sensor's pixels are in the image."""
+    left, top, width, height = camera.sampling.crop or (0, 0, camera.width, camera.height)
+    every = camera.sampling.every
+    return Sampling(
+        camera.width, camera.height, left, top, -(-width // every), -(-height // every), every
+    )
+
+
+def pinhole(camera: Camera) -> Pinhole:
+    """The camera in pixels of the image as it is sampled."""
+    return sampling(camera).pinhole(sensor_pinhole(camera))
+
+
+def _focal_length_px(pixels: int, fov_deg: float) -> float:
+    return pixels / 2.0 / float(np.tan(np.radians(fov_deg) / 2.0))
 
 
 def look_at(position_m: Floats, target_m: Floats, roll_rad: float = 0.0) -> Floats:
@@ -99,6 +126,7 @@ def sample_views(
         camera,
         nominal + rng.uniform(-position_m, position_m, (n, 3)),
         nominal_rotation @ euler_rotations(jitter),
+        np.tile(astuple(pinhole(camera)), (n, 1)),
         rng.uniform(*camera.near_m, n),
         rng.uniform(*camera.far_m, n),
         np.full(n, camera.noise_sigma_m),
@@ -114,11 +142,10 @@ def overviews(n: int, **other: Any) -> CameraPoses:
 
 def project(views: CameraPoses, points_m: Floats) -> Floats:
     """Pixel coordinates (n, k, 2) and depth of world points (n, k, 3), as (n, k, 3): u, v, z."""
-    camera = views.camera
     local = (points_m - views.position_m[:, None]) @ views.rotation
-    focal = focal_length_px(camera)
+    fx, fy, cx, cy = views.intrinsics.T[..., None]
     depth = local[..., 2]
     safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
-    u = camera.width / 2.0 + focal * local[..., 0] / safe
-    v = camera.height / 2.0 + focal * local[..., 1] / safe
+    u = cx + fx * local[..., 0] / safe
+    v = cy + fy * local[..., 1] / safe
     return np.stack([u, v, depth], axis=-1)

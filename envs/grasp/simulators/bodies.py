@@ -13,6 +13,7 @@ import pybullet
 
 from envs.grasp.robot.urdf import Robot
 from envs.grasp.scene.sampler import Scenes
+from envs.grasp.sensors.camera import sampling
 from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.base import Floats, Images
 from envs.grasp.simulators.colors import SUPPORT_RGBA
@@ -135,10 +136,10 @@ def take_picture(
 ) -> tuple[Images, Images]:
     """RGB (H, W, 3) and OpenGL's depth buffer (H, W), in the light of the first scene."""
     intensity = float(scene.light_intensity[0])
-    size = (camera.height, camera.width)
+    taken = sampling(camera)
     _, _, rgba, buffer, _ = pybullet.getCameraImage(
-        camera.width,
-        camera.height,
+        taken.width,
+        taken.height,
         view,
         projection,
         lightDirection=scene.light_direction[0].tolist(),
@@ -150,6 +151,7 @@ def take_picture(
         flags=pybullet.ER_NO_SEGMENTATION_MASK,
         physicsClientId=client,
     )
+    size = (taken.height, taken.width)
     return np.reshape(rgba, (*size, 4))[..., :3], np.reshape(buffer, size)
 
 

@@ -16,7 +16,7 @@ from envs.grasp.robot.kinematics import shape_reach
 from envs.grasp.robot.paths import Path, check_knots
 from envs.grasp.robot.urdf import Box, Robot
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import CameraPoses, focal_length_px
+from envs.grasp.sensors.camera import CameraPoses, sampling
 from envs.grasp.sensors.depth import Sensor, sensor_of
 from envs.grasp.settings import Support, check_resolution
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
@@ -286,22 +286,25 @@ def _view_arrays(views: CameraPoses, n: int) -> ViewArrays:
     """Camera poses as the kernels take them; there must be n, all possible ones."""
     _check(views.position_m, (n, 3), "position_m of the views")
     _check(views.rotation, (n, 3, 3), "rotation of the views")
+    _check(views.intrinsics, (n, 4), "intrinsics of the views")
     _check(views.near_m, (n,), "near_m of the views")
     _check(views.far_m, (n,), "far_m of the views")
     square = np.matmul(np.swapaxes(views.rotation, 1, 2), views.rotation)
     if (np.abs(square - np.eye(3)) > ORTHONORMAL_TOLERANCE).any():
         raise ValueError("rotation of the views must be rotations: orthonormal columns")
+    if not (views.intrinsics[:, :2] > 0.0).all():
+        raise ValueError("intrinsics of the views: focal lengths must be over 0")
     if not ((views.near_m > 0.0) & (views.near_m < views.far_m)).all():
         raise ValueError("near_m of the views must be over 0 and under far_m")
-    camera = views.camera
+    taken = sampling(views.camera)
     return ViewArrays(
         np.ascontiguousarray(views.position_m, np.float64),
         np.ascontiguousarray(views.rotation, np.float64),
         np.ascontiguousarray(views.near_m, np.float64),
         np.ascontiguousarray(views.far_m, np.float64),
-        focal_length_px(camera),
-        camera.width,
-        camera.height,
+        np.ascontiguousarray(views.intrinsics, np.float64),
+        taken.width,
+        taken.height,
     )
 
 

@@ -15,7 +15,7 @@ from envs.grasp.robot.kinematics import shape_reach
 from envs.grasp.robot.paths import Path, leg_poses, leg_speeds, legs
 from envs.grasp.robot.urdf import Robot
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import CameraPoses, focal_length_px
+from envs.grasp.sensors.camera import CameraPoses, sampling
 from envs.grasp.sensors.depth import sense_depth
 from envs.grasp.settings import Camera, Support, check_resolution
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
@@ -269,11 +269,13 @@ def projection_matrices(views: CameraPoses) -> list[list[float]]:
     TinyRenderer samples pixel (c, r) at the image point (c, r + 1), not at the pixel's centre; the
     picture is shifted by half a pixel each way to make up for it.
     """
-    camera, focal = views.camera, focal_length_px(views.camera)
+    taken = sampling(views.camera)
+    width, height = taken.width, taken.height
+    fx, fy, cx, cy = views.intrinsics.T
     near, far = views.near_m, views.far_m
     matrices = np.zeros((len(views), 4, 4))
-    matrices[:, 0, 0], matrices[:, 0, 2] = 2 * focal / camera.width, 1.0 / camera.width
-    matrices[:, 1, 1], matrices[:, 1, 2] = 2 * focal / camera.height, 1.0 / camera.height
+    matrices[:, 0, 0], matrices[:, 0, 2] = 2 * fx / width, (width - 2 * cx + 1.0) / width
+    matrices[:, 1, 1], matrices[:, 1, 2] = 2 * fy / height, (2 * cy - height + 1.0) / height
     matrices[:, 2, 2], matrices[:, 2, 3] = (
         -(far + near) / (far - near),
         -2 * far * near / (far - near),

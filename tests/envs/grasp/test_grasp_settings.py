@@ -54,3 +54,20 @@ def test_motions_are_those_two() -> None:
     assert GraspSettings().motion == "standoff"
     with pytest.raises(ValidationError, match="'standoff' or 'direct'"):
         GraspSettings.model_validate({"motion": "straight"})
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        ({"sampling": {"crop": [1, 0, 80, 80]}}, r"crop \[1, 0, 80, 80\] leaves .* 80x80"),
+        ({"sampling": {"every": 0}}, "greater than or equal to 1|greater than 0"),
+        (
+            {"fov_deg": 44.0, "intrinsics": {"fx": 9.0, "fy": 9.0, "cx": 1.0, "cy": 1.0}},
+            "intrinsics and fov_deg say the same",
+        ),
+        ({"intrinsics": {"fx": 9.0, "fy": 0.0, "cx": 1.0, "cy": 1.0}}, "greater than 0"),
+    ],
+)
+def test_cameras_that_can_not_be_are_refused(camera: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        GraspSettings.model_validate({"cameras": {"depth": {"type": "depth"} | camera}})

@@ -16,6 +16,7 @@ from curricula.samplers import (
     UniformParameters,
     UniformSampler,
 )
+from encoders.cameras import Pinhole, Sampling
 from encoders.spaces import DepthImage, RgbImage
 from envs.grasp.scene.sampler import heading
 from envs.grasp.settings import Camera, GraspSettings
@@ -121,7 +122,9 @@ def test_spaces_contain_what_is_delivered(make: MakeEnv, frame_grab: bool) -> No
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     spaces = env.single_observation_space.spaces
     focal_length_px = 16 / np.tan(np.radians(44.0 / 2))
-    assert spaces["depth"] == DepthImage(24, 32, focal_length_px=focal_length_px)
+    sensor = Sampling(32, 24, 0, 0, 32, 24, 1)
+    camera = Pinhole(focal_length_px, focal_length_px, 16.0, 12.0)
+    assert spaces["depth"] == DepthImage(24, 32, pinhole=camera, sampling=sensor)
     assert isinstance(spaces["above"], RgbImage)
     assert env.single_action_space == gymnasium.spaces.Box(-1, 1, (4,), np.float32)
     assert env.action_space.shape == (5, 4)

@@ -43,7 +43,7 @@ class ViewArrays(NamedTuple):
     rotation: Floats
     near_m: Floats
     far_m: Floats
-    focal_px: float
+    intrinsics: Floats
     width: int
     height: int
 
@@ -126,7 +126,16 @@ def _draw_world(
     """Draws everything in a world; `frames` (L, 3, 4) is room for the robot's links."""
     picture.inverse[:] = 0.0
     picture.colors[:] = WHITE
-    lens = Lens(views.focal_px, views.width, views.height, views.near_m[row], views.far_m[row])
+    lens = Lens(
+        views.intrinsics[row, 0],
+        views.intrinsics[row, 1],
+        views.intrinsics[row, 2],
+        views.intrinsics[row, 3],
+        views.width,
+        views.height,
+        views.near_m[row],
+        views.far_m[row],
+    )
     eye = Eye(
         (views.position[row, 0], views.position[row, 1], views.position[row, 2]),
         (views.rotation[row, 0, 0], views.rotation[row, 1, 0], views.rotation[row, 2, 0]),

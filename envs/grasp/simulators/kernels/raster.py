@@ -41,7 +41,10 @@ MIN_CORNER_DEPTH_M = 1e-3
 class Lens(NamedTuple):
     """A pinhole camera: where its rays go, and between which planes it sees."""
 
-    focal_px: float
+    fx: float
+    fy: float
+    cx: float
+    cy: float
     width: int
     height: int
     near_m: float
@@ -124,11 +127,18 @@ def in_sight(center: Vector, radius: float, lens: Lens) -> bool:
     x, y, z = center
     if z + radius < lens.near_m or z - radius > lens.far_m:
         return False
-    tan_u, tan_v = lens.width / 2.0 / lens.focal_px, lens.height / 2.0 / lens.focal_px
     return (
-        abs(x) - tan_u * z <= radius * math.sqrt(1.0 + tan_u * tan_u)
-        and abs(y) - tan_v * z <= radius * math.sqrt(1.0 + tan_v * tan_v)
-    )  # fmt: skip
+        _inside(x, z, (lens.width - lens.cx) / lens.fx, radius)
+        and _inside(-x, z, lens.cx / lens.fx, radius)
+        and _inside(y, z, (lens.height - lens.cy) / lens.fy, radius)
+        and _inside(-y, z, lens.cy / lens.fy, radius)
+    )
+
+
+@kernel()
+def _inside(x: float, z: float, tangent: float, radius: float) -> bool:
+    """Whether a ball at x to the side reaches into the half space x <= tangent * z."""
+    return x - tangent * z <= radius * math.sqrt(1.0 + tangent * tangent)
 
 
 @kernel()
@@ -145,14 +155,13 @@ def _covered(
         depth = center[2] + x_axis[2] * x + y_axis[2] * y + z_axis[2] * z
         if depth < MIN_CORNER_DEPTH_M:
             return Rectangle(0, lens.width, 0, lens.height)
-        scale = lens.focal_px / depth
-        u = scale * (center[0] + x_axis[0] * x + y_axis[0] * y + z_axis[0] * z)
-        v = scale * (center[1] + x_axis[1] * x + y_axis[1] * y + z_axis[1] * z)
+        u = lens.fx / depth * (center[0] + x_axis[0] * x + y_axis[0] * y + z_axis[0] * z)
+        v = lens.fy / depth * (center[1] + x_axis[1] * x + y_axis[1] * y + z_axis[1] * z)
         low_u, high_u = min(low_u, u), max(high_u, u)
         low_v, high_v = min(low_v, v), max(high_v, v)
     # From the pixels whose centres lie inside to those before and behind them.
-    low_u, high_u = low_u + lens.width / 2.0 - 1.0, high_u + lens.width / 2.0 + 1.0
-    low_v, high_v = low_v + lens.height / 2.0 - 1.0, high_v + lens.height / 2.0 + 1.0
+    low_u, high_u = low_u + lens.cx - 1.0, high_u + lens.cx + 1.0
+    low_v, high_v = low_v + lens.cy - 1.0, high_v + lens.cy + 1.0
     return Rectangle(
         int(max(0.0, low_u)),
         int(max(0.0, min(float(lens.width), high_u))),
@@ -163,8 +172,8 @@ def _covered(
 
 @kernel()
 def _slab(axis: Vector, center: Vector, half: float, lens: Lens) -> Slab:
-    right, down = axis[0] / lens.focal_px, axis[1] / lens.focal_px
-    start = axis[2] + (0.5 - lens.width / 2.0) * right + (0.5 - lens.height / 2.0) * down
+    right, down = axis[0] / lens.fx, axis[1] / lens.fy
+    start = axis[2] + (0.5 - lens.cx) * right + (0.5 - lens.cy) * down
     return Slab(right, down, start, dot(axis, center), half)
 
 
@@ -391,10 +400,10 @@ def _cylinder_row(
     cx, cz = np.float32(center[0]), np.float32(center[2])
     radius, length, cap = np.float32(size[0]), np.float32(size[1]), np.float32(size[2])
     near, far = np.float32(lens.near_m), np.float32(lens.far_m)
-    step = np.float32(1.0 / lens.focal_px)
-    first = np.float32((covered.first_column + 0.5 - lens.width / 2.0) / lens.focal_px)
-    ry = np.float32((row + 0.5 - lens.height / 2.0) / lens.focal_px)
-    oy = np.float32(center[2] * ((row + 0.5 - lens.height / 2.0) / lens.focal_px) - center[1])
+    step = np.float32(1.0 / lens.fx)
+    first = np.float32((covered.first_column + 0.5 - lens.cx) / lens.fx)
+    ry = np.float32((row + 0.5 - lens.cy) / lens.fy)
+    oy = np.float32(center[2] * ((row + 0.5 - lens.cy) / lens.fy) - center[1])
     offset = np.uint32(row * lens.width + covered.first_column)
     count = covered.end_column - covered.first_column
     colored = picture.colors.size > 0
@@ -439,8 +448,8 @@ def _shade_row(
         if picture.colors[pixel] != UNSHADED:
             continue
         depth = 1.0 / picture.inverse[pixel]
-        x = depth * (column + 0.5 - lens.width / 2.0) / lens.focal_px - center[0]
-        y = depth * (row + 0.5 - lens.height / 2.0) / lens.focal_px - center[1]
+        x = depth * (column + 0.5 - lens.cx) / lens.fx - center[0]
+        y = depth * (row + 0.5 - lens.cy) / lens.fy - center[1]
         normal = (x, y, depth - center[2])
         cosine = dot(normal, light.direction) / math.sqrt(dot(normal, normal))
         picture.colors[pixel] = shaded(color, cosine, light)

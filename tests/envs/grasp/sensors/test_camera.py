@@ -1,15 +1,20 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from encoders.cameras import Sampling
 from envs.grasp.sensors.camera import (
     CameraPoses,
     euler_rotations,
-    focal_length_px,
     look_at,
+    pinhole,
     project,
     sample_views,
+    sampling,
+    sensor_pinhole,
 )
 from envs.grasp.settings import Camera
 
@@ -24,9 +29,9 @@ def fixed(camera: Camera, count: int = 1) -> CameraPoses:
 
 
 def test_focal_length_comes_from_the_horizontal_field_of_view() -> None:
-    assert focal_length_px(FORWARD) == pytest.approx(50.0)
+    assert sensor_pinhole(FORWARD).fx == pytest.approx(50.0)
     narrow = Camera(type="depth", width=80, fov_deg=60)
-    assert focal_length_px(narrow) == pytest.approx(40 * np.sqrt(3))
+    assert sensor_pinhole(narrow).fx == pytest.approx(40 * np.sqrt(3))
 
 
 def test_project_hand_computed() -> None:
@@ -127,3 +132,29 @@ def test_sampled_views_stay_in_their_ranges_and_use_them() -> None:
         assert low <= values.min() < low + 0.02 * (high - low)
         assert high - 0.02 * (high - low) < values.max() <= high
     np.testing.assert_array_equal(views.noise_sigma_m, 0.004)
+
+
+def test_fields_of_view_of_their_own_across_and_down() -> None:
+    astra = sensor_pinhole(Camera(type="depth", width=640, height=480, fov_deg=(60.0, 49.5)))
+    assert astra.fx == pytest.approx(320 * np.sqrt(3))
+    assert astra.fy == pytest.approx(240 / np.tan(np.radians(24.75)))
+    assert (astra.cx, astra.cy) == (320.0, 240.0)
+
+
+def test_a_calibrated_camera_is_taken_at_its_word() -> None:
+    known = {"fx": 580.0, "fy": 570.0, "cx": 315.0, "cy": 245.5}
+    camera = Camera.model_validate({"type": "depth", "intrinsics": known})
+    assert dataclasses.asdict(sensor_pinhole(camera)) == known
+
+
+def test_every_so_manyth_pixel_of_a_crop() -> None:
+    camera = Camera.model_validate(
+        {
+            "type": "depth",
+            "width": 640,
+            "height": 480,
+            "sampling": {"crop": [10, 20, 601, 400], "every": 6},
+        }
+    )
+    assert sampling(camera) == Sampling(640, 480, 10, 20, 101, 67, 6)
+    assert pinhole(camera).fx == pytest.approx(sensor_pinhole(camera).fx / 6)

@@ -19,7 +19,7 @@ from envs.grasp.robot.kinematics import forward
 from envs.grasp.robot.paths import straight_leg
 from envs.grasp.robot.urdf import Box
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import CameraPoses, focal_length_px, sample_views
+from envs.grasp.sensors.camera import CameraPoses, pinhole, sample_views, sampling
 from envs.grasp.sensors.noise import fill_normals
 from envs.grasp.settings import Camera, GraspSettings, Support
 from envs.grasp.simulators.factory import make_simulator
@@ -36,6 +36,7 @@ from envs.grasp.threefry import threefry
 
 ROOT = Path(__file__).parents[4]
 SceneBuilder = Callable[..., Scenes]
+SimulatorMaker = Callable[..., FastSimulator | PyBulletSimulator]
 ASIDE = ((1.35, -0.38), 0.0, (0.1, 0.15, 0.15))
 
 
@@ -114,6 +115,30 @@ def test_what_the_camera_is_in_is_seen_through(
     assert (difference(*depths)[compared] < 1e-3).mean() > 0.99
 
 
+@pytest.mark.parametrize("make", [FastSimulator, PyBulletSimulator])
+def test_a_sampled_picture_has_the_pixels_of_the_whole_one(make: SimulatorMaker) -> None:
+    intrinsics = {"fx": 150.0, "fy": 120.0, "cx": 70.0, "cy": 63.0}
+    whole = {"type": "depth", "width": 150, "height": 120, "intrinsics": intrinsics}
+    part = whole | {"sampling": {"crop": [8, 5, 130, 110], "every": 3}}
+    cameras = {name: Camera.model_validate(c) for name, c in (("whole", whole), ("part", part))}
+    scenes, views = sampled(2, whole=cameras["part"])
+    everyone, view = np.arange(2), views["whole"]
+    simulator = make(2, ROBOT, Support())
+    simulator.load(everyone, scenes, home(2))
+    pictures = {
+        name: simulator.render(
+            everyone,
+            replace(view, camera=camera, intrinsics=fixed_views(camera, 2).intrinsics),
+        )
+        for name, camera in cameras.items()
+    }
+    simulator.close()
+    expected = sampling(cameras["part"]).take(pictures["whole"])
+    assert pictures["part"].shape == expected.shape == (2, 37, 44)
+    close = np.isclose(pictures["part"], expected, atol=2e-5)
+    assert close.mean() > 0.999  # but for a pixel on an edge
+
+
 # -- pictures, from the geometry alone -------------------------------------------------------------
 
 
@@ -171,7 +196,7 @@ def test_a_seen_point_lies_on_a_surface_and_nothing_lies_before_it(seed: int) ->
     views = sample_views(camera, np.random.default_rng(seed), 1, 0.02, 20.0)
     depth = simulator.render(FIRST, views)[0].astype(float)
     row, column = np.nonzero(np.isfinite(depth))
-    focal = focal_length_px(camera)
+    focal = pinhole(camera).fx
     rays = np.stack(
         [(column + 0.5 - 61 / 2) / focal, (row + 0.5 - 47 / 2) / focal, np.ones(len(row))], axis=1
     )

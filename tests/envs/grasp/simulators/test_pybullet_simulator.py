@@ -16,7 +16,7 @@ from worlds import FIRST, RESOLUTION_M, ROBOT, fixed_views, home, pose, reaching
 from encoders.spaces import DepthImage
 from envs.grasp.robot.paths import straight_leg
 from envs.grasp.scene.sampler import Scenes
-from envs.grasp.sensors.camera import CameraPoses, focal_length_px, sample_views
+from envs.grasp.sensors.camera import CameraPoses, pinhole, sample_views
 from envs.grasp.sensors.depth import sense_depth
 from envs.grasp.settings import Camera, GraspSettings, Support
 from envs.grasp.simulators import pybullet as pybullet_module
@@ -55,7 +55,7 @@ def cast_rays(scenes: Scenes, views: CameraPoses) -> tuple[np.ndarray, np.ndarra
     Written from the geometry alone: each ray is turned into each box's frame and clipped there.
     """
     camera, support = views.camera, Support()
-    focal, rows = focal_length_px(camera), len(scenes)
+    focal, rows = pinhole(camera).fx, len(scenes)
     column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack(
         [
@@ -217,7 +217,7 @@ def _middle_of_face(views: CameraPoses) -> tuple[int, int, float]:
     camera = views.camera
     away = np.array([1.05, 0.0, 0.7]) - views.position_m[0]
     x, y, z = away @ views.rotation[0]
-    focal = focal_length_px(camera)
+    focal = pinhole(camera).fx
     return int(camera.width / 2 + focal * x / z), int(camera.height / 2 + focal * y / z), z
 
 
