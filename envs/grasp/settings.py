@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
-    AfterValidator,
     BaseModel,
     Field,
     FiniteFloat,
@@ -16,18 +15,9 @@ from pydantic import (
     model_validator,
 )
 
+from envs.grasp.ranges import Point, Range
 from envs.grasp.scene.blocks import MIN_BAR_M
-
-
-def _ordered(value: tuple[float, float]) -> tuple[float, float]:
-    low, high = value
-    if low > high:
-        raise ValueError(f"a range goes from low to high, and {low} is above {high}")
-    return value
-
-
-Range = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_ordered)]
-Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+from envs.grasp.sensors.structured_light import Gaussian, StructuredLight
 
 MIN_CONTACT_RESOLUTION_M = 1e-6
 # Well under the thinnest bar of a block, so that nothing is passed through.
@@ -111,15 +101,26 @@ class Camera(BaseModel, frozen=True, extra="forbid"):
         0.002,
         ge=0.0,
         le=MAX_NOISE_SIGMA_M,
-        description="Depth only: sigma of the Gaussian noise.",
+        description="Depth and sensor: gaussian only: sigma of the noise.",
     )
     missing_fraction: Range = Field(
         (0.0, 0.0),
         description="Depth only: probability of each pixel to be missing, drawn at every reset.",
     )
+    sensor: Gaussian | StructuredLight = Field(
+        Gaussian(),
+        discriminator="type",
+        description="Depth only: how the camera errs, `gaussian` or `structured_light`, by its "
+        "name alone or with settings beside its `type`.",
+    )
     encoding: Literal["uint16", "uint8"] = Field(
         "uint16", description="Depth only: uint16 millimetres, or uint8 over the range."
     )
+
+    @field_validator("sensor", mode="before")
+    @classmethod
+    def _name_alone_will_do(cls, value: Any) -> Any:
+        return {"type": value} if isinstance(value, str) else value
 
     @model_validator(mode="after")
     def _is_possible(self) -> Camera:

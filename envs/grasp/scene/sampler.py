@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.grasp.batch import Batch
+from envs.grasp.scene.dark import draw_dark
 from envs.grasp.scene.placement import place_blocks, rules
 from envs.grasp.sensors.camera import CameraPoses, sample_views
+from envs.grasp.sensors.structured_light import StructuredLight
 from envs.grasp.settings import GraspSettings, Randomize
 from envs.grasp.simulators.thread_pool import ThreadPool
 
@@ -121,7 +123,20 @@ class SceneSampler:
                 "block_y_m, lower blocks or target_lead_m, or let the cameras see more (fov_deg, "
                 "position_m)"
             )
-        return scenes, views
+        return scenes, {name: self._with_dark(rng, scenes, view) for name, view in views.items()}
+
+    def _with_dark(
+        self, rng: np.random.Generator, scenes: Scenes, view: CameraPoses
+    ) -> CameraPoses:
+        """The same cameras, to which some of what they see is dark."""
+        sensor = view.camera.sensor
+        if not isinstance(sensor, StructuredLight):
+            return view
+        boxes = (scenes.box_center_m, scenes.box_half_m)
+        dark, missing = draw_dark(
+            sensor, self._settings, rng, boxes, scenes.block_position_m, scenes.block_yaw_rad
+        )
+        return view.with_arrays({"dark": dark, "dark_missing": missing})
 
 
 def _light_directions(rng: np.random.Generator, randomize: Randomize, n: int) -> Floats:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from encoders.cameras import Pinhole, Sampling
 from envs.grasp.batch import Batch
+from envs.grasp.sensors.structured_light import StructuredLight
 from envs.grasp.settings import Camera
 
 Floats = NDArray[np.float64]
@@ -32,6 +33,12 @@ class CameraPoses(Batch):
         near_m, far_m: (n,) clip planes.
         noise_sigma_m: (n,) sigma of a depth camera's noise.
         missing_fraction: (n,) probability that a depth camera misses a pixel.
+        sensor_strength: (n,) factor on a structured-light camera's faults.
+        depth_scale_error: (n,) its depths' relative error.
+        depth_offset_m: (n,) its depths' common error.
+        dark: (n, K, 4, 3) boxes in the world frame that hold dark or shiny surfaces: the centre,
+            and three axes over the half extents.
+        dark_missing: (n, K) share of the pixels that it misses on each.
     """
 
     camera: Camera
@@ -42,6 +49,11 @@ class CameraPoses(Batch):
     far_m: Floats
     noise_sigma_m: Floats
     missing_fraction: Floats
+    sensor_strength: Floats
+    depth_scale_error: Floats
+    depth_offset_m: Floats
+    dark: Floats
+    dark_missing: Floats
 
 
 # Outside, with the whole robot and the support in view.
@@ -118,11 +130,14 @@ def euler_rotations(angles_rad: Floats) -> Floats:
 def sample_views(
     camera: Camera, rng: np.random.Generator, n: int, position_m: float, rotation_deg: float
 ) -> CameraPoses:
-    """Places n cameras, moved by up to +-`position_m` and turned by `rotation_deg` per axis."""
+    """Places n cameras, moved by up to +-`position_m` and turned by `rotation_deg` per axis.
+
+    A structured-light camera's faults are drawn, too; nothing in view is dark.
+    """
     nominal = np.array(camera.position_m)
     nominal_rotation = look_at(nominal, np.array(camera.target_m), np.radians(camera.roll_deg))
     jitter = np.radians(rng.uniform(-rotation_deg, rotation_deg, (n, 3)))
-    return CameraPoses(
+    views = CameraPoses(
         camera,
         nominal + rng.uniform(-position_m, position_m, (n, 3)),
         nominal_rotation @ euler_rotations(jitter),
@@ -131,6 +146,34 @@ def sample_views(
         rng.uniform(*camera.far_m, n),
         np.full(n, camera.noise_sigma_m),
         rng.uniform(*camera.missing_fraction, n),
+        np.ones(n),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros((n, 0, 4, 3)),
+        np.zeros((n, 0)),
+    )
+    sensor = camera.sensor
+    return _with_faults(views, sensor, rng) if isinstance(sensor, StructuredLight) else views
+
+
+def _with_faults(
+    views: CameraPoses, sensor: StructuredLight, rng: np.random.Generator
+) -> CameraPoses:
+    """The same cameras with a structured-light camera's errors of calibration."""
+    n, taken = len(views), sampling(views.camera)
+    strength = rng.uniform(*sensor.strength, n)
+    focal = 1.0 + strength * rng.uniform(-sensor.focal_scale, sensor.focal_scale, n)
+    sides_px = np.array([taken.sensor_width, taken.sensor_height]) / taken.every
+    center_px = rng.uniform(-sensor.center_fraction, sensor.center_fraction, (n, 2)) * sides_px
+    focal_px = views.intrinsics[:, :2] * focal[:, None]
+    middle_px = views.intrinsics[:, 2:] + strength[:, None] * center_px
+    return views.with_arrays(
+        {
+            "intrinsics": np.concatenate([focal_px, middle_px], axis=1),
+            "sensor_strength": strength,
+            "depth_scale_error": rng.uniform(-sensor.depth_scale, sensor.depth_scale, n),
+            "depth_offset_m": rng.uniform(-sensor.depth_offset_m, sensor.depth_offset_m, n),
+        }
     )
 
 

@@ -1,7 +1,7 @@
 """The depth sensor's model: from true depth to the raw image, in both simulators the same numbers.
 
-True depth -> Gaussian noise -> what is outside the range or missing becomes "nothing seen" ->
-encoding. What is random in a picture comes from its seed alone.
+True depth -> noise, Gaussian or of structured light -> what is outside the range or missing becomes
+"nothing seen" -> encoding. What is random in a picture comes from its seed alone.
 """
 
 from __future__ import annotations
@@ -13,6 +13,15 @@ from numpy.typing import NDArray
 
 from encoders.spaces import NOTHING_SEEN, DepthImage
 from envs.grasp.sensors.camera import CameraPoses
+from envs.grasp.sensors.matching import (
+    NO_MATCHING,
+    Desk,
+    Limits,
+    Matching,
+    desk,
+    match,
+    matching_of,
+)
 from envs.grasp.sensors.noise import FAST, fill_normals, fill_uniforms
 from envs.grasp.settings import MAX_NOISE_SIGMA_M
 from envs.grasp.simulators.kernels.worlds import kernel
@@ -32,6 +41,7 @@ class Sensor(NamedTuple):
         min_m, max_m: ends of the range.
         zero_m, codes_per_m: code = (depth - zero_m) * codes_per_m.
         first, last: codes of the ends.
+        matching: of a structured-light camera, or none.
     """
 
     seeds: NDArray[np.uint64]
@@ -43,6 +53,25 @@ class Sensor(NamedTuple):
     codes_per_m: float
     first: int
     last: int
+    matching: Matching
+
+
+NO_SENSOR = Sensor(
+    np.empty(0, np.uint64), np.empty(0), np.empty(0), 0.0, 0.0, 0.0, 0.0, 0, 0, NO_MATCHING
+)
+
+
+class Workbench(NamedTuple):
+    """Room to work on one picture of P pixels.
+
+    Attributes:
+        normals, uniforms: (P or P + 1,) random numbers.
+        desk: of a structured-light camera.
+    """
+
+    normals: Pixels
+    uniforms: Pixels
+    desk: Desk
 
 
 def sensor_of(views: CameraPoses, space: DepthImage, seeds: NDArray[np.uint64]) -> Sensor:
@@ -71,6 +100,7 @@ def sensor_of(views: CameraPoses, space: DepthImage, seeds: NDArray[np.uint64]) 
         space.zero_m,
         space.codes_per_m,
         *space.codes,
+        matching_of(views),
     )
 
 
@@ -94,20 +124,52 @@ def sense_depth(
 
 @kernel()
 def _sense_rows(depths: Pixels, sensor: Sensor, codes: Codes) -> None:
-    normals, uniforms = scratch(depths.shape[1])
+    bench = workbench(sensor, depths.shape[1])
     for row in range(len(depths)):
-        sense(depths[row], False, sensor, row, normals, uniforms, codes[row])
+        sense(depths[row], False, sensor, row, bench, codes[row])
 
 
 @kernel()
-def scratch(pixels: int) -> tuple[Pixels, Pixels]:
-    """Room for the random numbers of one picture, for `sense`."""
+def workbench(sensor: Sensor, pixels: int) -> Workbench:
+    """Room to work on one picture, for `sense`."""
     even = (pixels + 1) // 2 * 2
-    return np.zeros(even, np.float32), np.zeros(even, np.float32)
+    return Workbench(np.zeros(even, np.float32), np.zeros(even, np.float32), desk(sensor.matching))
+
+
+@kernel()
+def sense(
+    true: Pixels, inverse: bool, sensor: Sensor, row: int, bench: Workbench, codes: Codes
+) -> None:
+    """Writes the codes (P,) of one picture.
+
+    Args:
+        true: (P or more,) true depth in metres, infinite where nothing is hit; or one over it.
+        inverse: which of the two. A renderer has the inverse.
+        sensor: of n pictures.
+        row: which of them this is.
+        bench: room to work.
+        codes: (P,) written.
+    """
+    if not len(sensor.matching.strength):
+        _sense_gaussian(true, inverse, sensor, row, bench.normals, bench.uniforms, codes)
+        return
+    if not inverse:
+        for pixel in range(len(codes)):
+            bench.normals[pixel] = np.float32(1.0) / true[pixel]
+        true = bench.normals
+    limits = Limits(
+        sensor.min_m,
+        sensor.max_m,
+        sensor.zero_m,
+        sensor.codes_per_m,
+        sensor.first,
+        sensor.last,
+    )
+    match(true, sensor.matching, row, sensor.seeds[row], limits, bench.desk, codes)
 
 
 @kernel(fastmath=FAST)
-def sense(
+def _sense_gaussian(
     true: Pixels,
     inverse: bool,
     sensor: Sensor,
@@ -116,17 +178,7 @@ def sense(
     uniforms: Pixels,
     codes: Codes,
 ) -> None:
-    """Writes the codes (P,) of one picture; without noise, those of `DepthImage.encode`.
-
-    Args:
-        true: (P,) true depth in metres, infinite where nothing is hit; or one over it.
-        inverse: which of the two. A renderer has the inverse, and its division costs nothing here.
-        sensor: of n pictures.
-        row: which of them this is.
-        normals: (P or P + 1,) from `scratch`.
-        uniforms: the same.
-        codes: (P,) written.
-    """
+    """As `sense`, with white noise alone; without noise, the codes of `DepthImage.encode`."""
     if sensor.sigma_m[row] > 0.0:
         fill_normals(sensor.seeds[row], normals)
     # Where it is 0, it multiplies what an earlier picture left in the scratch.

@@ -14,7 +14,7 @@ from envs.grasp.threefry import threefry
 
 FAST = {"contract", "reassoc", "nsz", "arcp", "afn"}
 # The second words of the counters, so that no two kinds of numbers have the same bits.
-NORMALS, UNIFORMS = np.uint32(0), np.uint32(1)
+NORMALS, UNIFORMS, BITS = np.uint32(0), np.uint32(1), np.uint32(2)
 MANTISSA_BITS = np.int32(23)
 # Of the float32 next to sqrt(1/2): mantissas go from there to sqrt(2).
 HALF_ROOT_BITS = np.int32(0x3F3504F3)
@@ -77,6 +77,20 @@ def fill_normals(seed: np.uint64, out: NDArray[np.float32]) -> None:
         )
         out[i] = radius * sign * (sine if swapped else cosine)
         out[half + i] = radius * sign * (cosine if swapped else sine)
+
+
+@kernel(fastmath=FAST)
+def fill_bits(seed: np.uint64, out: NDArray[np.uint32]) -> None:
+    """Fills an array of even length with random bits.
+
+    Args:
+        seed: uint64, of which every one gives other numbers.
+        out: (2 k,) whose halves are the two numbers of each pair.
+    """
+    half = np.uint32(len(out) // 2)
+    key = (np.uint32(seed), np.uint32(seed >> np.uint64(32)))
+    for i in range(half):
+        out[i], out[half + i] = threefry(key, (np.uint32(i), BITS))
 
 
 @kernel(fastmath=FAST)

@@ -17,7 +17,7 @@ from envs.grasp.robot.paths import Path, check_knots
 from envs.grasp.robot.urdf import Box, Robot
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses, sampling
-from envs.grasp.sensors.depth import Sensor, sensor_of
+from envs.grasp.sensors.depth import NO_SENSOR, Sensor, sensor_of
 from envs.grasp.settings import Support, check_resolution
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
 from envs.grasp.simulators.colors import BLOCK_RGBA, SUPPORT_RGBA
@@ -31,7 +31,6 @@ ORTHONORMAL_TOLERANCE = 1e-6
 NO_DEPTHS = np.empty((0, 0, 0), np.float32)
 NO_COLORS = np.empty((0, 0, 0, 3), np.uint8)
 NO_CODES = np.empty((0, 0, 0), np.uint16)
-NO_SENSOR = Sensor(np.empty(0, np.uint64), np.empty(0), np.empty(0), 0.0, 0.0, 0.0, 0.0, 0, 0)
 
 
 class FastSimulator:

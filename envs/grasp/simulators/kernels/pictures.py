@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.grasp.sensors.depth import Sensor, scratch, sense
+from envs.grasp.sensors.depth import Sensor, sense, workbench
 from envs.grasp.simulators.kernels.raster import (
     FAST,
     Canvas,
@@ -87,7 +87,7 @@ def take_pictures(
     """
     picture = canvas(views.height, views.width, len(colors) > 0)
     frames = np.empty((len(robot.parents), 3, 4))
-    normals, uniforms = scratch(views.height * views.width)
+    bench = workbench(sensor, views.height * views.width)
     for row in range(begin, end):
         _draw_world(picture, robot, worlds, indices[row], views, row, frames)
         if len(depths):
@@ -95,7 +95,7 @@ def take_pictures(
         if len(colors):
             _to_color(picture.colors, colors[row])
         if len(codes):
-            sense(picture.inverse, True, sensor, row, normals, uniforms, codes[row])
+            sense(picture.inverse, True, sensor, row, bench, codes[row])
 
 
 @kernel()
