@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import (
     BaseModel,
@@ -107,9 +107,11 @@ class Camera(BaseModel, frozen=True, extra="forbid"):
         (0.0, 0.0),
         description="Depth only: probability of each pixel to be missing, drawn at every reset.",
     )
-    sensor: Gaussian | StructuredLight = Field(
+    sensor: (
+        Literal["gaussian", "structured_light"]
+        | Annotated[Gaussian | StructuredLight, Field(discriminator="type")]
+    ) = Field(
         Gaussian(),
-        discriminator="type",
         description="Depth only: how the camera errs, `gaussian` or `structured_light`, by its "
         "name alone or with settings beside its `type`.",
     )
@@ -117,10 +119,15 @@ class Camera(BaseModel, frozen=True, extra="forbid"):
         "uint16", description="Depth only: uint16 millimetres, or uint8 over the range."
     )
 
-    @field_validator("sensor", mode="before")
+    @field_validator("sensor")
     @classmethod
-    def _name_alone_will_do(cls, value: Any) -> Any:
-        return {"type": value} if isinstance(value, str) else value
+    def _name_means_the_defaults(cls, value: str | BaseModel) -> BaseModel:
+        # Not before validation: what that returns is no JSON any more, whose lists are tuples.
+        sensors: dict[str, type[BaseModel]] = {
+            "gaussian": Gaussian,
+            "structured_light": StructuredLight,
+        }
+        return sensors[value]() if isinstance(value, str) else value
 
     @model_validator(mode="after")
     def _is_possible(self) -> Camera:
