@@ -122,9 +122,8 @@ def test_spaces_contain_what_is_delivered(make: MakeEnv, frame_grab: bool) -> No
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     spaces = env.single_observation_space.spaces
     focal_length_px = 16 / np.tan(np.radians(44.0 / 2))
-    sensor = Sampling(32, 24, 0, 0, 32, 24, 1)
     camera = Pinhole(focal_length_px, focal_length_px, 16.0, 12.0)
-    assert spaces["depth"] == DepthImage(24, 32, pinhole=camera, sampling=sensor)
+    assert spaces["depth"] == DepthImage(24, 32, pinhole=camera)
     assert isinstance(spaces["above"], RgbImage)
     assert env.single_action_space == gymnasium.spaces.Box(-1, 1, (4,), np.float32)
     assert env.action_space.shape == (5, 4)
@@ -754,3 +753,13 @@ def test_privileged_numbers_may_leave_out_the_goals_limits(make: MakeEnv) -> Non
     for method, given in (("reset", {"seed": 0}), ("step", {"actions": actions})):
         seen = [getattr(env, method)(**given)[0]["privileged"] for env in (whole, without)]
         np.testing.assert_array_equal(seen[1], np.delete(seen[0], np.s_[13:17], axis=1))
+
+
+def test_the_space_of_a_sampled_camera_says_which_pixels_it_has(make: MakeEnv) -> None:
+    taken = {"crop": [2, 4, 28, 20], "every": 3}
+    camera = Camera.model_validate({"type": "depth", "width": 32, "height": 24, "sampling": taken})
+    env = make(2, cameras={"depth": camera})
+    space = env.single_observation_space["depth"]
+    assert isinstance(space, DepthImage)
+    assert space.sampling == Sampling(32, 24, 2, 4, 10, 7, 3)
+    assert env.reset(seed=0)[0]["depth"].shape == (2, 7, 10, 1)
