@@ -155,6 +155,19 @@ class SceneSampler:
         )
         return view.with_arrays({"dark": dark, "dark_missing": missing})
 
+    def check(self, scenes: Scenes) -> None:
+        """Refuses scenes of a task that draws other arrays.
+
+        Raises:
+            ValueError: something stands around in one of the two only.
+        """
+        if bool(scenes.around_half_m.shape[1]) == (self._around is None):
+            theirs, ours = ("with", "without") if self._around is None else ("without", "with")
+            raise ValueError(
+                f"the scenes were drawn {theirs} environment.randomize.surroundings, and are to go "
+                f"on {ours}: set it as it was"
+            )
+
     def _surround(
         self, rules: SurroundingRules, scenes: Scenes, seeds: NDArray[np.uint64], camera_m: Floats
     ) -> None:

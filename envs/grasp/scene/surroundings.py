@@ -522,10 +522,10 @@ def _draw_cable(
         return
     half = uniform(stream, rules.cable_m[0], rules.cable_m[1]) / 2
     own = part(boxes, CABLE.start, CABLE.stop)
-    end = np.empty(3)
+    hangs, end = uniform(stream, 0.0, 1.0) < HANGING, np.empty(3)
     for _ in range(TRIES):
         _clear(own)
-        if uniform(stream, 0.0, 1.0) < HANGING:
+        if hangs:
             first = _hang(stream, rules, own, half, end)
         else:
             first = _begin_anywhere(stream, rules, end)
