@@ -19,10 +19,9 @@ from envs.grasp.scene.surroundings import (
     FLOOR,
     FRAME,
     ON_TABLE,
-    SMALL_SHARE,
-    THING_BOXES,
     THINGS,
 )
+from envs.grasp.scene.things import SMALL_SHARE, THING_BOXES
 from envs.grasp.sensors.camera import CameraPoses, project
 from envs.grasp.settings import GraspSettings, Support
 from envs.grasp.simulators.fast import FastSimulator
