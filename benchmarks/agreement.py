@@ -24,7 +24,7 @@ from envs.grasp.robot.arm import Arm
 from envs.grasp.robot.urdf import Robot, load_robot
 from envs.grasp.scene.sampler import Scenes, SceneSampler
 from envs.grasp.sensors.camera import CameraPoses
-from envs.grasp.settings import Camera, GraspSettings, Support
+from envs.grasp.settings import Camera, GraspSettings, Randomize, Support, Surroundings
 from envs.grasp.simulators.base import Contacts, Simulator
 from envs.grasp.simulators.fast import FastSimulator
 from envs.grasp.simulators.pybullet import PyBulletSimulator
@@ -73,13 +73,26 @@ class Agreement:
 
 
 class Sample:
-    """Random scenes, and random poses and motions of the robots before them."""
+    """Random scenes, and random poses and motions of the robots before them.
 
-    def __init__(self, scenes: int, size: tuple[int, int], seed: int = 0):
+    Args:
+        scenes: how many.
+        size: width and height of the pictures.
+        seed: of everything random.
+        surroundings: what stands around; None: nothing.
+    """
+
+    def __init__(
+        self,
+        scenes: int,
+        size: tuple[int, int],
+        seed: int = 0,
+        surroundings: Surroundings | None = None,
+    ):
         width, height = size
         self.rng = np.random.default_rng(seed)
         cameras = {kind: Camera(type=kind, width=width, height=height) for kind in ("depth", "rgb")}
-        settings = GraspSettings(cameras=cameras)
+        settings = GraspSettings(cameras=cameras, randomize=Randomize(surroundings=surroundings))
         limits = np.full(scenes, np.pi)
         self.scenes, self.views = SceneSampler(settings).sample(self.rng, limits)
         self.everywhere = np.arange(scenes)
@@ -101,7 +114,10 @@ class Sample:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compares, prints a table, and writes JSON where asked; 1 if they agree too little."""
     options = parse(arguments)
-    found, _ = compare(options.scenes, options.motions, tuple(options.size), options.seed)
+    surroundings = Surroundings() if options.surroundings else None
+    found, _ = compare(
+        options.scenes, options.motions, tuple(options.size), options.seed, surroundings
+    )
     if options.json is not None:
         options.json.write_text(json.dumps(asdict(found), indent=2) + "\n")
     Console().print(shown(found))
@@ -116,12 +132,19 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--motions", type=int, default=20, help="of each scene")
     parser.add_argument("--size", type=int, nargs=2, default=[80, 80], metavar=("W", "H"))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--surroundings", action="store_true", help="with all that can stand around the blocks"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here, too")
     return parser.parse_args(arguments)
 
 
 def compare(
-    scenes: int, motions: int, size: tuple[int, int], seed: int = 0
+    scenes: int,
+    motions: int,
+    size: tuple[int, int],
+    seed: int = 0,
+    surroundings: Surroundings | None = None,
 ) -> tuple[Agreement, tuple[Images, Images]]:
     """Compares the simulators.
 
@@ -130,11 +153,12 @@ def compare(
         motions: of each scene.
         size: width and height of the pictures.
         seed: of everything random.
+        surroundings: what stands around in the scenes; None: nothing.
 
     Returns:
         What was found, and the depths (n, H, W) in metres by PyBullet and by the fast simulator.
     """
-    sample = Sample(scenes, size, seed)
+    sample = Sample(scenes, size, seed, surroundings)
     exact, fast = (
         photographs(simulator, sample) for simulator in (PyBulletSimulator, FastSimulator)
     )
@@ -243,8 +267,13 @@ def contacts(
 
 def grown(scenes: Scenes, grow_m: float) -> Scenes:
     """The same scenes with larger boxes."""
-    half = scenes.box_half_m
-    return scenes.with_arrays({"box_half_m": np.where(half > 0.0, half + grow_m, 0.0)})
+    return scenes.with_arrays(
+        {
+            name: np.where(half > 0.0, half + grow_m, 0.0)
+            for name, half in scenes.arrays().items()
+            if name in ("box_half_m", "around_half_m")
+        }
+    )
 
 
 def shown(found: Agreement) -> Table:

@@ -25,6 +25,8 @@ MAX_CONTACT_RESOLUTION_M = 0.02
 MAX_NOISE_SIGMA_M = 1.0
 # About as far as the arm can go straight ahead at all.
 MAX_STANDOFF_M = 1.0
+MAX_BACKDROP_YAW_DEG = 45.0
+MAX_CABLE_M = 0.02
 
 
 def check_resolution(resolution_m: float) -> float:
@@ -186,6 +188,69 @@ class Support(BaseModel, frozen=True, extra="forbid"):
 
 
 Shape = Literal["parallelepiped", "L", "U"]
+Thing = Literal["T", "cross", "plate", "post", "cube", "slab", "tilted", "column"]
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+MAX_THINGS = 2
+
+
+class Surroundings(BaseModel, frozen=True, extra="forbid"):
+    """What there is beside the robot, the table's top and the blocks, drawn at every reset.
+
+    None of it is a block: no box, L or U whose face has sides of `block_size_m`.
+    """
+
+    floor: Probability = Field(1.0, description="Probability of a floor, at height 0.")
+    frame: Probability = Field(0.9, description="Probability that legs carry the table's top.")
+    wall: Probability = Field(0.4, description="Probability of a wall behind the table.")
+    rack: Probability = Field(
+        0.4, description="Probability of a rack in the wall's place: posts and shelves."
+    )
+    distance_m: Range = Field(
+        (0.10, 0.60), description="From the table to the wall or the rack behind it."
+    )
+    yaw_deg: Range = Field((-15.0, 15.0), description="Yaw of the wall or the rack.")
+    cable: Probability = Field(
+        0.5, description="Probability of a cable that lies on the table or hangs from it."
+    )
+    cable_m: Range = Field((0.005, 0.012), description="Thickness of the cable.")
+    things: tuple[int, int] = Field(
+        (0, MAX_THINGS),
+        description=f"Fewest and most things on the table that are no blocks, {MAX_THINGS} at "
+        "most; one that finds no room is left out.",
+    )
+    kinds: tuple[Thing, ...] = Field(
+        ("T", "cross", "plate", "post", "cube", "slab", "tilted", "column"),
+        min_length=1,
+        description="Kinds of such things.",
+    )
+
+    @model_validator(mode="after")
+    def _is_possible(self) -> Surroundings:
+        if self.wall + self.rack > 1.0:
+            raise ValueError(
+                f"wall {self.wall} and rack {self.rack}: there is one of them at most, so the sum "
+                "of their probabilities is 1 at most"
+            )
+        if self.distance_m[0] < 0.0:
+            raise ValueError(
+                f"distance_m {list(self.distance_m)}: wall and rack stand behind the table, 0 m or "
+                "more"
+            )
+        if max(map(abs, self.yaw_deg)) > MAX_BACKDROP_YAW_DEG:
+            raise ValueError(
+                f"yaw_deg {list(self.yaw_deg)}: keep it within +-{MAX_BACKDROP_YAW_DEG:g}, or the "
+                "wall comes round to the robot"
+            )
+        if self.cable_m[0] <= 0.0 or self.cable_m[1] > MAX_CABLE_M:
+            raise ValueError(
+                f"cable_m {list(self.cable_m)} must lie over 0 and up to {MAX_CABLE_M:g} m"
+            )
+        if not 0 <= self.things[0] <= self.things[1] <= MAX_THINGS:
+            raise ValueError(
+                f"things {list(self.things)} goes from the fewest, 0 or more, to the most, "
+                f"{MAX_THINGS} at most"
+            )
+        return self
 
 
 class Randomize(BaseModel, frozen=True, extra="forbid"):
@@ -208,6 +273,11 @@ class Randomize(BaseModel, frozen=True, extra="forbid"):
     light_azimuth_deg: Range = Field((-180.0, 180.0), description="RGB: where the light stands.")
     light_elevation_deg: Range = Field((30.0, 80.0), description="RGB: the light's elevation.")
     light_intensity: Range = Field((0.4, 0.9), description="RGB: diffuse share of the light.")
+    surroundings: Surroundings | None = Field(
+        None,
+        description="What stands around: floor, wall or rack, the table's frame, a cable, things "
+        "that are no blocks. null: nothing; {}: all of it, as by default.",
+    )
 
     @model_validator(mode="after")
     def _blocks_can_be_built(self) -> Randomize:

@@ -173,6 +173,7 @@ class GraspVectorEnv(Environment):
         """
         episodes = RunningEpisodes.from_state_dict(state, self._settings.cameras)
         self._arm.check(episodes.tools)
+        self._sampler.check(episodes.scenes)
         self._rng.bit_generator.state = state["rng"]
         self._episodes = episodes
         self._simulator.load(self._everyone, episodes.scenes, episodes.tools.joints_rad)

@@ -29,6 +29,9 @@ def box_scene() -> Callable[[Sequence[BoxBlock]], Scenes]:
             block_position_m=position,
             block_yaw_rad=yaw,
             target_m=position[:, 0] + [0.0, 0.0, blocks[0][2][2] / 2],
+            around_center_m=np.zeros((1, 0, 3)),
+            around_rotation=np.zeros((1, 0, 3, 3)),
+            around_half_m=np.zeros((1, 0, 3)),
             light_direction=np.array([[0.0, 0.0, 1.0]]),
             light_intensity=np.array([0.6]),
         )

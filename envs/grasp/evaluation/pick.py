@@ -21,11 +21,13 @@ from envs.grasp.robot.arm import Arm
 from envs.grasp.robot.kinematics import InverseKinematics, tooltip_pose
 from envs.grasp.robot.paths import Path, leg_speeds, legs, path_poses, straight_leg
 from envs.grasp.scene.sampler import Scenes, to_world
+from envs.grasp.scene.surroundings import FLOOR, SOLID
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Pick, Support
 from envs.grasp.simulators.base import Floats, Images
 from envs.grasp.simulators.bodies import (
     UPRIGHT,
+    add_around,
     add_boxes,
     add_robot,
     add_support,
@@ -202,6 +204,8 @@ class Attempt:
         self._joints_rad = arm.robot.home_rad
         set_joints(client, self._robot, self._joints_rad)
         table = add_support(client, support)
+        for part in (*SOLID, FLOOR):
+            add_around(client, scene, part)
         blocks = [self._add_block(number) for number in range(scene.box_half_m.shape[1])]
         for body in (table, *blocks):
             pybullet.changeDynamics(

@@ -217,7 +217,7 @@ def _reachable(rules: Rules, target_m: Floats, yaw_rad: float) -> bool:
 
 
 @numba.njit(cache=True)
-def _footprint(
+def footprint(
     size_m: Floats, position_m: Floats, yaw_rad: float, grow_m: float, corners_m: Floats
 ) -> None:
     """Writes the four corners (4, 3) of a block seen from above, grown on every side."""
@@ -235,26 +235,26 @@ def _apart_on_support(rules: Rules, size_m: Floats, position_m: Floats, yaw_rad:
     count = len(size_m)
     corners = np.empty((count, 4, 3))
     for block in range(count):
-        _footprint(size_m[block], position_m[block], yaw_rad[block], 0.0, corners[block])
+        footprint(size_m[block], position_m[block], yaw_rad[block], 0.0, corners[block])
         for corner in range(4):
             for axis in range(2):
                 value = corners[block, corner, axis]
                 if not rules.support_low_m[axis] <= value <= rules.support_high_m[axis]:
                     return False
-        _footprint(
+        footprint(
             size_m[block], position_m[block], yaw_rad[block], BLOCK_CLEARANCE_M / 2, corners[block]
         )
         for other in range(block):
             if not (
-                _separated(corners[block], corners[other], yaw_rad[block])
-                or _separated(corners[block], corners[other], yaw_rad[other])
+                separated(corners[block], corners[other], yaw_rad[block])
+                or separated(corners[block], corners[other], yaw_rad[other])
             ):
                 return False
     return True
 
 
 @numba.njit(cache=True)
-def _separated(first_m: Floats, second_m: Floats, yaw_rad: float) -> bool:
+def separated(first_m: Floats, second_m: Floats, yaw_rad: float) -> bool:
     """Whether a line along or across `yaw` separates two rectangles (4, 3) seen from above."""
     for angle in (yaw_rad, yaw_rad + math.pi / 2):
         x, y = math.cos(angle), math.sin(angle)

@@ -56,14 +56,14 @@ class CameraPoses(Batch):
     dark_missing: Floats
 
 
-# Outside, with the whole robot and the support in view.
+# Outside, with the whole robot and the support in view, and before a wall behind them.
 OVERVIEW = Camera(
     type="rgb",
     width=640,
     height=480,
-    fov_deg=62.0,
-    position_m=(2.0, -1.6, 1.6),
-    target_m=(0.7, 0.0, 0.9),
+    fov_deg=56.0,
+    position_m=(1.1, -2.2, 1.7),
+    target_m=(0.8, 0.0, 0.85),
     near_m=(0.1, 0.1),
     far_m=(10.0, 10.0),
 )

@@ -29,8 +29,8 @@ class Contacts:
 
     Attributes:
         touched: (n,) the cup touched the target block.
-        collided: (n,) any link touched a block or the support, or the cup touched the support or
-            another block.
+        collided: (n,) any link touched a block, the support or what stands around, or the cup
+            touched any of these but the target block.
     """
 
     touched: NDArray[np.bool_]
@@ -38,13 +38,13 @@ class Contacts:
 
 
 class Simulator(Protocol):
-    """N worlds, each with the robot, the support and the blocks of one scene.
+    """N worlds, each with the robot, the support, and the blocks and surroundings of one scene.
 
     Every call names the n worlds it is about by `indices` (n,), rising and without repeats.
     """
 
     def load(self, indices: Indices, scenes: Scenes, joints_rad: Floats) -> None:
-        """Puts the blocks of n scenes in place and the robots' joints at (n, 6)."""
+        """Puts what stands in n scenes in place and the robots' joints at (n, 6)."""
 
     def move(self, indices: Indices, path_rad: Path, resolution_m: float) -> Contacts:
         """Moves n robots along paths, and stays at their ends.

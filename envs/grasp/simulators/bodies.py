@@ -16,8 +16,9 @@ from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import sampling
 from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.base import Floats, Images
-from envs.grasp.simulators.colors import SUPPORT_RGBA
+from envs.grasp.simulators.colors import AROUND_RGBA, SUPPORT_RGBA
 
+Rgba = tuple[float, float, float, float]
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 
 
@@ -91,28 +92,54 @@ def add_support(client: int, support: Support) -> int:
 
 
 def add_boxes(
-    client: int, center_m: Floats, half_m: Floats, rgba: tuple[float, ...], mass_kg: float = 0.0
+    client: int,
+    center_m: Floats,
+    half_m: Floats,
+    rgba: Rgba | list[Rgba],
+    mass_kg: float = 0.0,
+    orientations: list[list[float]] | None = None,
 ) -> int:
-    """Adds one body made of boxes (k, 3); with a mass of 0 it never moves.
+    """Adds one body made of boxes (k, 3), 16 at most; with a mass of 0 it never moves.
 
-    Its centre of mass is the origin of its frame.
+    Its centre of mass is the origin of its frame. Colors and orientations are those of each box, or
+    one color of all, and none is turned.
     """
     count, centers, halves = len(half_m), center_m.tolist(), half_m.tolist()
+    turns = orientations or [UPRIGHT] * count
     collision = pybullet.createCollisionShapeArray(
         shapeTypes=[pybullet.GEOM_BOX] * count,
         halfExtents=halves,
         collisionFramePositions=centers,
+        collisionFrameOrientations=turns,
         physicsClientId=client,
     )
     visual = pybullet.createVisualShapeArray(
         shapeTypes=[pybullet.GEOM_BOX] * count,
         halfExtents=halves,
         visualFramePositions=centers,
-        rgbaColors=[rgba] * count,
+        visualFrameOrientations=turns,
+        rgbaColors=rgba if isinstance(rgba, list) else [rgba] * count,
         physicsClientId=client,
     )
     body: int = pybullet.createMultiBody(mass_kg, collision, visual, physicsClientId=client)
     return body
+
+
+def add_around(client: int, scene: Scenes, part: slice) -> int | None:
+    """Adds a part of what stands around in the first scene, where it stands; None if it is empty.
+
+    It is one body, which never moves.
+    """
+    used = part.start + np.flatnonzero(scene.around_half_m[0, part, 0] > 0.0)
+    if not len(used):
+        return None
+    return add_boxes(
+        client,
+        scene.around_center_m[0, used],
+        scene.around_half_m[0, used],
+        [AROUND_RGBA[box] for box in used],
+        orientations=[quaternion(turn) for turn in scene.around_rotation[0, used]],
+    )
 
 
 def put(client: int, body: int, position_m: list[float], orientation: list[float]) -> None:
@@ -129,6 +156,23 @@ def block_boxes(scene: Scenes, number: int) -> tuple[Floats, Floats]:
 def turned(yaw_rad: float) -> list[float]:
     """The quaternion (x, y, z, w) of a turn about the vertical."""
     return [0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2)]
+
+
+def quaternion(rotation: Floats) -> list[float]:
+    """The quaternion (x, y, z, w) of a rotation (3, 3).
+
+    It is the eigenvector to the largest eigenvalue of a matrix whose entries are sums of the
+    rotation's. Bar-Itzhack, "New method for extracting the quaternion from a rotation matrix",
+    Journal of Guidance, Control, and Dynamics 23(6), 2000.
+    """
+    skew = rotation.T - rotation
+    matrix = np.zeros((4, 4))
+    matrix[:3, :3] = rotation + rotation.T - np.trace(rotation) * np.eye(3)
+    matrix[3, :3] = matrix[:3, 3] = skew[1, 2], skew[2, 0], skew[0, 1]
+    matrix[3, 3] = np.trace(rotation)
+    values, vectors = np.linalg.eigh(matrix)
+    found: list[float] = vectors[:, np.argmax(values)].tolist()
+    return found
 
 
 def take_picture(

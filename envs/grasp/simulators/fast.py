@@ -15,12 +15,13 @@ from encoders.spaces import DepthImage
 from envs.grasp.robot.kinematics import shape_reach
 from envs.grasp.robot.paths import Path, check_knots
 from envs.grasp.robot.urdf import Box, Robot
+from envs.grasp.scene import surroundings
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses, sampling
 from envs.grasp.sensors.depth import NO_SENSOR, Sensor, sensor_of
 from envs.grasp.settings import Support, check_resolution
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
-from envs.grasp.simulators.colors import BLOCK_RGBA, SUPPORT_RGBA
+from envs.grasp.simulators.colors import AROUND_RGBA, BLOCK_RGBA, SUPPORT_RGBA
 from envs.grasp.simulators.kernels.contacts import touch_along
 from envs.grasp.simulators.kernels.pictures import ViewArrays, take_pictures
 from envs.grasp.simulators.kernels.worlds import RobotArrays, WorldArrays
@@ -50,7 +51,7 @@ class FastSimulator:
         self._threads = ThreadPool(threads)
         self._robot = robot_arrays(robot)
         self._num_worlds, self._support = num_worlds, support
-        self._worlds = _empty_worlds(num_worlds, 1, len(self._robot.axes))
+        self._worlds = _empty_worlds(num_worlds, 1, 2, len(self._robot.axes))
         self._loaded = np.zeros(num_worlds, bool)
 
     def load(self, indices: Indices, scenes: Scenes, joints_rad: Floats) -> None:
@@ -63,19 +64,20 @@ class FastSimulator:
         _check_scenes(scenes, len(indices))
         _check(joints_rad, (len(indices), len(self._robot.axes)), "joints_rad")
         blocks, boxes = scenes.box_half_m.shape[1:3]
-        self._reserve(1 + blocks * boxes)
-        worlds, count = self._worlds, 1 + blocks * boxes
+        around = scenes.around_half_m.shape[1]
+        count, rooms = 1 + blocks * boxes + around, 2 + (len(surroundings.SOLID) if around else 0)
+        self._reserve(count, rooms)
+        worlds = self._worlds
         center, axes, half = _boxes(scenes)
         worlds.half[indices, count:] = 0.0
         worlds.radius[indices, count:] = 0.0
         worlds.center[indices, 1:count], worlds.half[indices, 1:count] = center, half
         worlds.axes[indices, 1:count] = axes
         worlds.radius[indices, 1:count] = np.linalg.norm(half, axis=-1)
-        worlds.low[indices], worlds.high[indices] = _room(worlds, indices)
+        _set_rooms(worlds, indices, blocks * boxes, around > 0)
         worlds.is_target[indices, 1 : 1 + boxes] = True
         worlds.is_target[indices, 1 + boxes :] = False
-        colors = [BLOCK_RGBA[number % len(BLOCK_RGBA)] for number in range(blocks)]
-        worlds.colors[indices, 1:count] = np.repeat(_color_levels(colors), boxes, axis=0)
+        worlds.colors[indices, 1:count] = _box_colors(blocks, boxes, around)
         length = np.linalg.norm(scenes.light_direction, axis=1, keepdims=True)
         worlds.light[indices] = scenes.light_direction / length
         worlds.diffuse[indices] = scenes.light_intensity
@@ -187,14 +189,16 @@ class FastSimulator:
             raise ValueError(f"worlds {missing.tolist()} hold no scene yet: load one first")
         return indices
 
-    def _reserve(self, boxes: int) -> None:
-        """Makes room for so many boxes a world, of which the first is the support."""
+    def _reserve(self, boxes: int, rooms: int) -> None:
+        """Makes place for so many boxes and rooms a world, of which the first is the support's."""
         before = self._worlds
-        if self._loaded.any() and before.half.shape[1] >= boxes:
+        had = before.half.shape[1], before.low.shape[1]
+        if self._loaded.any() and had[0] >= boxes and had[1] >= rooms:
             return
-        self._worlds = _empty_worlds(self._num_worlds, boxes, len(self._robot.axes))
+        boxes, rooms = max(boxes, had[0]), max(rooms, had[1])
+        self._worlds = _empty_worlds(self._num_worlds, boxes, rooms, len(self._robot.axes))
         for old, new in zip(before, self._worlds, strict=True):
-            # Only the axis of the boxes, if any, has another length.
+            # Only the axis of the boxes or the rooms, if any, has another length.
             new[tuple(slice(size) for size in old.shape)] = old
         support, worlds = self._support, self._worlds
         (x_low, x_high), (y_low, y_high) = support.x_m, support.y_m
@@ -237,14 +241,15 @@ def robot_arrays(robot: Robot) -> RobotArrays:
     )
 
 
-def _empty_worlds(worlds: int, boxes: int, joints: int) -> WorldArrays:
+def _empty_worlds(worlds: int, boxes: int, rooms: int, joints: int) -> WorldArrays:
     return WorldArrays(
         center=np.zeros((worlds, boxes, 3)),
         axes=np.zeros((worlds, boxes, 3, 3)),
         half=np.zeros((worlds, boxes, 3)),
         radius=np.zeros((worlds, boxes)),
-        low=np.zeros((worlds, 2, 3)),
-        high=np.zeros((worlds, 2, 3)),
+        starts=np.zeros((worlds, rooms + 1), np.int64),
+        low=np.full((worlds, rooms, 3), np.inf),
+        high=np.full((worlds, rooms, 3), -np.inf),
         is_target=np.zeros((worlds, boxes), bool),
         colors=np.zeros((worlds, boxes, 3)),
         light=np.zeros((worlds, 3)),
@@ -254,7 +259,10 @@ def _empty_worlds(worlds: int, boxes: int, joints: int) -> WorldArrays:
 
 
 def _boxes(scenes: Scenes) -> tuple[Floats, Floats, Floats]:
-    """Centres (n, k, 3), axes (n, k, 3, 3) and half extents (n, k, 3) in the world frame."""
+    """Centres (n, k, 3), axes (n, k, 3, 3) and half extents (n, k, 3) in the world frame.
+
+    First come the blocks', then what stands around.
+    """
     n, blocks, boxes = scenes.box_half_m.shape[:3]
     cosine, sine = np.cos(scenes.block_yaw_rad), np.sin(scenes.block_yaw_rad)
     turn = np.zeros((n, blocks, 3, 3))
@@ -265,20 +273,38 @@ def _boxes(scenes: Scenes) -> tuple[Floats, Floats, Floats]:
     )
     axes = np.broadcast_to(turn[:, :, None], (n, blocks, boxes, 3, 3))
     return (
-        center.reshape(n, -1, 3),
-        axes.reshape(n, -1, 3, 3),
-        scenes.box_half_m.reshape(n, -1, 3),
+        np.concatenate([center.reshape(n, -1, 3), scenes.around_center_m], axis=1),
+        np.concatenate([axes.reshape(n, -1, 3, 3), scenes.around_rotation], axis=1),
+        np.concatenate([scenes.box_half_m.reshape(n, -1, 3), scenes.around_half_m], axis=1),
     )
 
 
-def _room(worlds: WorldArrays, indices: Indices) -> tuple[Floats, Floats]:
-    """Lower and upper ends (n, 2, 3) of the room that support and blocks of some worlds take."""
+def _box_colors(blocks: int, boxes: int, around: int) -> Floats:
+    """Colors (k, 3) of the boxes of `_boxes`."""
+    rgba = [BLOCK_RGBA[number % len(BLOCK_RGBA)] for number in range(blocks)]
+    of_blocks = np.repeat(_color_levels(rgba), boxes, axis=0)
+    return np.concatenate([of_blocks, _color_levels(AROUND_RGBA)[:around]])
+
+
+def _set_rooms(worlds: WorldArrays, indices: Indices, blocks: int, around: bool) -> None:
+    """Sets the rooms of some worlds: of the support, of the blocks' boxes, and of those around."""
+    first = 1 + blocks
+    parts = [slice(0, 1), slice(1, first)]
+    if around:
+        parts += [slice(first + part.start, first + part.stop) for part in surroundings.SOLID]
     center, half = worlds.center[indices], worlds.half[indices]
     reach = np.matmul(np.abs(worlds.axes[indices]), half[..., None])[..., 0]
     there = worlds.radius[indices, :, None] > 0.0
     low, high = np.where(there, center - reach, np.inf), np.where(there, center + reach, -np.inf)
-    first = np.array([0, 1])  # the support's box, and the blocks' first
-    return np.minimum.reduceat(low, first, axis=1), np.maximum.reduceat(high, first, axis=1)
+    worlds.starts[indices], worlds.low[indices], worlds.high[indices] = (
+        parts[-1].stop,
+        np.inf,
+        -np.inf,
+    )
+    for room, part in enumerate(parts):
+        worlds.starts[indices, room] = part.start
+        worlds.low[indices, room] = low[:, part].min(axis=1)
+        worlds.high[indices, room] = high[:, part].max(axis=1)
 
 
 def _view_arrays(views: CameraPoses, n: int) -> ViewArrays:
@@ -322,6 +348,12 @@ def _check_scenes(scenes: Scenes, n: int) -> None:
     _check(scenes.box_half_m, (n, *scenes.box_half_m.shape[1:3], 3), "box_half_m of the scenes")
     _check(scenes.block_position_m, (n, blocks, 3), "block_position_m of the scenes")
     _check(scenes.block_yaw_rad, (n, blocks), "block_yaw_rad of the scenes")
+    around = scenes.around_half_m.shape[1]
+    if around not in (0, surroundings.BOXES):
+        raise ValueError(f"around_half_m of the scenes has {around} boxes, not 0 or all the parts'")
+    _check(scenes.around_center_m, (n, around, 3), "around_center_m of the scenes")
+    _check(scenes.around_rotation, (n, around, 3, 3), "around_rotation of the scenes")
+    _check(scenes.around_half_m, (n, around, 3), "around_half_m of the scenes")
     _check(scenes.light_direction, (n, 3), "light_direction of the scenes")
     _check(scenes.light_intensity, (n,), "light_intensity of the scenes")
     sides = scenes.box_half_m > 0.0

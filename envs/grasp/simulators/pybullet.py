@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pybullet
@@ -14,6 +14,7 @@ from encoders.spaces import DepthImage
 from envs.grasp.robot.kinematics import shape_reach
 from envs.grasp.robot.paths import Path, leg_poses, leg_speeds, legs
 from envs.grasp.robot.urdf import Robot
+from envs.grasp.scene import surroundings
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses, sampling
 from envs.grasp.sensors.depth import sense_depth
@@ -21,6 +22,7 @@ from envs.grasp.settings import Camera, Support, check_resolution
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices
 from envs.grasp.simulators.bodies import (
     UPRIGHT,
+    add_around,
     add_boxes,
     add_robot,
     add_support,
@@ -39,7 +41,7 @@ from envs.grasp.simulators.colors import BLOCK_RGBA
 CLIENTS_PER_PROCESS = 8
 # PyBullet keeps some 10 kB of every removed body until its whole simulation is reset.
 LOADS_BEFORE_RESET = 400
-PARKED_M = [0.0, 0.0, -1000.0]
+PARKED_M, ORIGIN_M = [0.0, 0.0, -1000.0], [0.0, 0.0, 0.0]
 # Of the window: how long a pose is shown, and how far the robot moves, at most, to the next.
 WINDOW_POSE_S, WINDOW_POSE_M = 0.04, 0.02
 # Distances are asked for up to this: PyBullet takes longer the more it has to measure.
@@ -126,18 +128,32 @@ class _Found:
 
 @dataclass
 class _World:
-    """State of one of a client's worlds."""
+    """State of one of a client's worlds.
+
+    Its bodies are the blocks, then what stands around; each has its pose. The untouchable ones are
+    seen, and can't be touched.
+    """
 
     scene: Scenes
     joints_rad: Floats
-    blocks: list[int]
     poses: list[tuple[list[float], list[float]]]
+    solid: list[int] = field(default_factory=list)
+    untouchable: list[int] = field(default_factory=list)
+
+    @property
+    def bodies(self) -> list[int]:
+        """All of them."""
+        return self.solid + self.untouchable
+
+    def place(self, number: int) -> tuple[list[float], list[float]]:
+        """Where one of the bodies is put: what stands around is built where it stands."""
+        return self.poses[number] if number < len(self.poses) else (ORIGIN_M, UPRIGHT)
 
 
 class _Client:
     """One physics server. Its worlds share the robot and the support, and take turns.
 
-    The blocks of the worlds that wait are parked out of sight. Contacts are asked for pair by pair
+    The bodies of the worlds that wait are parked out of sight. Contacts are asked for pair by pair
     (`getClosestPoints`), which keeps nothing from one question to the next, so that a run which is
     resumed sees what an uninterrupted one sees.
     """
@@ -154,18 +170,18 @@ class _Client:
 
     def load(self, slot: int, scene: Scenes, joints_rad: Floats) -> None:
         if slot in self._worlds:
-            for body in self._worlds[slot].blocks:
+            for body in self._worlds[slot].bodies:
                 pybullet.removeBody(body, physicsClientId=self._id)
         positions, yaws = scene.block_position_m[0].tolist(), scene.block_yaw_rad[0].tolist()
         poses = [(position, turned(yaw)) for position, yaw in zip(positions, yaws, strict=True)]
-        self._worlds[slot] = _World(scene, joints_rad, [], poses)
+        self._worlds[slot] = _World(scene, joints_rad, poses)
         self._active = None if self._active == slot else self._active
         self._loads += 1
         if self._loads % LOADS_BEFORE_RESET == 0:
             pybullet.resetSimulation(physicsClientId=self._id)
             self._build()
         else:
-            self._add_blocks(self._worlds[slot])
+            self._add_bodies(self._worlds[slot])
 
     def move(self, slot: int, path_rad: Path, resolution_m: float) -> tuple[bool, bool]:
         """Moves along a path (2 k + 1, 6); returns whether it touched, and whether it collided."""
@@ -201,26 +217,34 @@ class _Client:
         self._robot = add_robot(self._id, self._kinematics)
         self._table = add_support(self._id, self._support)
         for world in self._worlds.values():
-            self._add_blocks(world)
+            self._add_bodies(world)
 
-    def _add_blocks(self, world: _World) -> None:
-        """Adds a world's blocks, parked."""
-        world.blocks = []
-        for number in range(world.scene.box_half_m.shape[1]):
-            color = BLOCK_RGBA[number % len(BLOCK_RGBA)]
-            world.blocks.append(add_boxes(self._id, *block_boxes(world.scene, number), color))
-            put(self._id, world.blocks[-1], PARKED_M, UPRIGHT)
+    def _add_bodies(self, world: _World) -> None:
+        """Adds a world's bodies, parked."""
+        scene = world.scene
+        blocks = [
+            add_boxes(self._id, *block_boxes(scene, number), BLOCK_RGBA[number % len(BLOCK_RGBA)])
+            for number in range(scene.box_half_m.shape[1])
+        ]
+        solid, untouchable = (
+            [add_around(self._id, scene, part) for part in parts]
+            for parts in (surroundings.SOLID, (surroundings.FLOOR,))
+        )
+        world.solid = blocks + [body for body in solid if body is not None]
+        world.untouchable = [body for body in untouchable if body is not None]
+        for body in world.bodies:
+            put(self._id, body, PARKED_M, UPRIGHT)
 
     def _activate(self, slot: int) -> None:
-        """Parks the blocks of the world before, and puts this one's in place."""
+        """Parks the bodies of the world before, and puts this one's in place."""
         if slot == self._active:
             return
         if self._active is not None:
-            for body in self._worlds[self._active].blocks:
+            for body in self._worlds[self._active].bodies:
                 put(self._id, body, PARKED_M, UPRIGHT)
         world = self._worlds[slot]
-        for body, (position_m, orientation) in zip(world.blocks, world.poses, strict=True):
-            put(self._id, body, position_m, orientation)
+        for number, body in enumerate(world.bodies):
+            put(self._id, body, *world.place(number))
         set_joints(self._id, self._robot, world.joints_rad)
         self._active = slot
 
@@ -240,7 +264,7 @@ class _Client:
         """
         set_joints(self._id, self._robot, joints_rad)
         clear_m = SIGHT_M
-        for number, body in enumerate((*world.blocks, self._table)):
+        for number, body in enumerate((*world.solid, self._table)):
             for point in pybullet.getClosestPoints(
                 self._robot.body, body, distance=SIGHT_M, physicsClientId=self._id
             ):

@@ -695,6 +695,29 @@ def test_the_state_of_another_standoff_is_refused(make: MakeEnv, other: dict[str
         another.load_state_dict(env.state_dict())
 
 
+@pytest.mark.parametrize("simulator", ["fast", "pybullet"])
+def test_a_state_has_what_stands_around(make: MakeEnv, simulator: str) -> None:
+    options = {"randomize": {"surroundings": {}}, "simulator": simulator, "frame_grab": False}
+    env, resumed = make(3, **options), make(3, seed=9, **options)
+    env.reset(seed=0)
+    play(env, 2, 0)
+    state = env.state_dict()
+    same(resumed.load_state_dict(state), env._observations())
+    same(play(resumed, 4, 1), play(env, 4, 1))
+    np.testing.assert_array_equal(resumed.scenes.around_half_m, env.scenes.around_half_m)
+
+
+@pytest.mark.parametrize(("there", "message"), [(True, "drawn with "), (False, "drawn without ")])
+def test_a_state_with_other_surroundings_is_refused(
+    make: MakeEnv, *, there: bool, message: str
+) -> None:
+    full, bare = make(2, randomize={"surroundings": {}}), make(2)
+    drawn, other = (full, bare) if there else (bare, full)
+    drawn.reset(seed=0)
+    with pytest.raises(ValueError, match=message + r"environment\.randomize\.surroundings"):
+        other.load_state_dict(drawn.state_dict())
+
+
 def test_the_robots_stand_where_the_state_has_them() -> None:
     settings = GraspSettings(num_envs=2, workers=0, cameras=SMALL)
     env = GraspVectorEnv(settings, [], render_mode="rgb_array")

@@ -221,11 +221,7 @@ def _look(
         radius, link, bend = radii[shape], links[shape], room.bends[shape]
         center = in_world(frames, link, poses[shape, 0, 3], poses[shape, 1, 3], poses[shape, 2, 3])
         speed = _largest_speed(frames, room.turns, room.drifts, room.rates, link, center, radius)
-        square = min(
-            _square_beyond(worlds.low, worlds.high, world, 0, center),
-            _square_beyond(worlds.low, worlds.high, world, 1, center),
-        )
-        clear = math.sqrt(square) - radius
+        clear = math.sqrt(_square_beyond_all(worlds.low, worlds.high, world, center)) - radius
         done = collided and (touched or not robot.is_cup[shape])
         idle[shape] = done or clear > left * (speed + left * bend / 2.0)
         far = step * (speed + step * bend / 2.0)
@@ -262,28 +258,32 @@ def _nearest(
     radius, link, half = robot.shape_radius[shape], robot.shape_links[shape], robot.shape_half
     is_cylinder, is_cup = robot.is_cylinder[shape], robot.is_cup[shape]
     axes, sizes, clear = worlds.axes, worlds.half, far
-    for box in range(sizes.shape[1]):
-        touch = is_cup and worlds.is_target[world, box]
-        reach = worlds.radius[world, box]
-        if reach == 0.0 or (touched if touch else collided):
-            continue
-        offset = minus(center, triple(worlds.center, world, box))
+    for part in range(worlds.low.shape[1]):
         within = radius + clear
-        if dot(offset, offset) > (reach + within) * (reach + within):
+        if _square_beyond(worlds.low, worlds.high, world, part, center) > within * within:
             continue
-        square = _see(offset, axes, sizes, world, box, pair.offset)
-        if square > within * within:
-            continue
-        apart = math.sqrt(square) - radius
-        if apart > radius:
-            clear = apart
-            continue
-        _turn(frames, link, robot.shape_poses, shape, axes, world, box, pair.turn)
-        gap = max(gap_between(is_cylinder, half[shape], sizes[world, box], pair), apart)
-        if gap <= 0.0 and meets(is_cylinder, half[shape], sizes[world, box], pair):
-            touched, collided = touched or touch, collided or not touch
-        else:
-            clear = min(clear, max(gap, 0.0))
+        for box in range(worlds.starts[world, part], worlds.starts[world, part + 1]):
+            touch = is_cup and worlds.is_target[world, box]
+            reach = worlds.radius[world, box]
+            if reach == 0.0 or (touched if touch else collided):
+                continue
+            offset = minus(center, triple(worlds.center, world, box))
+            within = radius + clear
+            if dot(offset, offset) > (reach + within) * (reach + within):
+                continue
+            square = _see(offset, axes, sizes, world, box, pair.offset)
+            if square > within * within:
+                continue
+            apart = math.sqrt(square) - radius
+            if apart > radius:
+                clear = apart
+                continue
+            _turn(frames, link, robot.shape_poses, shape, axes, world, box, pair.turn)
+            gap = max(gap_between(is_cylinder, half[shape], sizes[world, box], pair), apart)
+            if gap <= 0.0 and meets(is_cylinder, half[shape], sizes[world, box], pair):
+                touched, collided = touched or touch, collided or not touch
+            else:
+                clear = min(clear, max(gap, 0.0))
     return clear, touched, collided
 
 
@@ -367,11 +367,20 @@ def _largest_speed(
 
 @kernel(counts=False)
 def _square_beyond(low: Floats, high: Floats, world: int, part: int, point: Vector) -> float:
-    """The squared distance of a point to the room that the support or the blocks take."""
+    """The squared distance of a point to one of the rooms; infinite if that is empty."""
     square = 0.0
     for i in range(3):
         beyond = max(0.0, low[world, part, i] - point[i], point[i] - high[world, part, i])
         square += beyond * beyond
+    return square
+
+
+@kernel(counts=False)
+def _square_beyond_all(low: Floats, high: Floats, world: int, point: Vector) -> float:
+    """The squared distance of a point to the nearest of the rooms."""
+    square = math.inf
+    for part in range(low.shape[1]):
+        square = min(square, _square_beyond(low, high, world, part, point))
     return square
 
 

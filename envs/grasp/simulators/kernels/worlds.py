@@ -74,8 +74,11 @@ class WorldArrays(NamedTuple):
         axes: (N, K, 3, 3) whose columns are the boxes' axes.
         half: (N, K, 3) half extents, zero where there is no box.
         radius: (N, K) of the balls about the boxes.
-        low: (N, 2, 3) lower ends of the room that the support takes, and that all others take.
-        high: (N, 2, 3) their upper ends.
+        starts: (N, R + 1) first boxes of R rooms, of which each has those before the next one's:
+            the support, the blocks, and what stands around. Behind the last is what can't be
+            touched.
+        low: (N, R, 3) lower ends of the rooms that these take.
+        high: (N, R, 3) their upper ends.
         is_target: (N, K) whether the box belongs to the target block.
         colors: (N, K, 3) in [0, 255].
         light: (N, 3) unit vectors towards the light.
@@ -87,6 +90,7 @@ class WorldArrays(NamedTuple):
     axes: Floats
     half: Floats
     radius: Floats
+    starts: Integers
     low: Floats
     high: Floats
     is_target: Bools

@@ -14,7 +14,8 @@ from envs.grasp.robot.arm import Arm
 from envs.grasp.robot.kinematics import tooltip_pose
 from envs.grasp.robot.urdf import load_robot
 from envs.grasp.scene.sampler import Scenes, SceneSampler, heading
-from envs.grasp.settings import GraspSettings, Pick, Randomize, Support
+from envs.grasp.scene.surroundings import BOXES, FLOOR, THINGS
+from envs.grasp.settings import GraspSettings, Pick, Randomize, Support, Surroundings
 
 BuildScene = Callable[..., Scenes]
 GAP_M = 0.015
@@ -149,6 +150,31 @@ def test_a_pick_is_the_same_whatever_came_before(picker: Picker, box_scene: Buil
     first = course()
     picker.pick(other, *aim(other, yaw_deg=20.0))
     assert course() == first
+
+
+def test_what_stands_around_is_in_the_way_only_where_it_stands(
+    picker: Picker, box_scene: BuildScene
+) -> None:
+    bare = box_scene([BOX])
+    for x, outcome in ((0.92, Outcome.COLLISION), (1.3, Outcome.SUCCESS)):  # before, and behind
+        center, half = np.zeros((2, 1, BOXES, 3))
+        center[0, THINGS.start], half[0, THINGS.start] = (x, 0.0, 0.7), (0.01, 0.01, 0.1)
+        # The base stands on the floor, and that is no contact.
+        center[0, FLOOR.start], half[0, FLOOR.start] = (0.0, 0.0, -0.05), (3.0, 3.0, 0.05)
+        turns = np.tile(np.eye(3), (1, BOXES, 1, 1))
+        scene = bare.with_arrays(
+            {"around_center_m": center, "around_half_m": half, "around_rotation": turns}
+        )
+        assert picker.pick(scene, *aim(scene)) == outcome
+
+
+def test_a_perfect_pose_picks_among_all_that_stands_around(picker: Picker) -> None:
+    around = Surroundings(things=(2, 2), cable=1.0)
+    settings = GraspSettings(randomize=Randomize(surroundings=around))
+    scenes, _ = SceneSampler(settings).sample(np.random.default_rng(4), np.full(12, np.pi))
+    for row in range(12):
+        scene = scenes[row : row + 1]
+        assert picker.pick(scene, *aim(scene)) == Outcome.SUCCESS
 
 
 def test_a_pose_too_near_for_a_run_up_is_driven_to_all_the_same(
