@@ -199,6 +199,9 @@ class Surroundings(BaseModel, frozen=True, extra="forbid"):
     None of it is a block: no box, L or U whose face has sides of `block_size_m`.
     """
 
+    present: Probability = Field(
+        1.0, description="Probability that there is anything of this at all in a scene."
+    )
     floor: Probability = Field(1.0, description="Probability of a floor, at height 0.")
     frame: Probability = Field(0.9, description="Probability that legs carry the table's top.")
     wall: Probability = Field(0.4, description="Probability of a wall behind the table.")

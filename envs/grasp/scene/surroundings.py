@@ -47,6 +47,7 @@ OWN_NUMBERS = np.uint64(2**63)
 class SurroundingRules(NamedTuple):
     """The settings as plain numbers and arrays; ranges are (low, high). See `Surroundings`."""
 
+    present: float
     floor: float
     frame: float
     wall: float
@@ -67,6 +68,7 @@ def surrounding_rules(settings: GraspSettings, surroundings: Surroundings) -> Su
     support = settings.support
     low = [support.x_m[0], support.y_m[0], support.top_m - support.thickness_m]
     return SurroundingRules(
+        present=surroundings.present,
         floor=surroundings.floor,
         frame=surroundings.frame,
         wall=surroundings.wall,
@@ -123,6 +125,8 @@ def surround(
     for row in range(begin, end):
         center_m[row], rotation[row], half_m[row] = 0.0, 0.0, 0.0
         boxes, stream = Boxes(center_m[row], rotation[row], half_m[row]), streams[row]
+        if uniform(stream, 0.0, 1.0) >= rules.present:
+            continue
         _draw_far(stream, rules, boxes)
         for block in range(blocks):
             take_block(

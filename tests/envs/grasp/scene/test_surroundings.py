@@ -140,6 +140,11 @@ def test_parts_come_as_often_as_they_should(scenes: Scenes) -> None:
     np.testing.assert_allclose(np.bincount(things) / COUNT, 1 / 3, atol=0.08)
 
 
+def test_some_scenes_have_none_of_it() -> None:
+    there = used(sample(settings({"present": 0.7}))[0]).any(axis=1)
+    assert there.mean() == pytest.approx(0.7, abs=0.07)
+
+
 def test_axes_are_rotations(scenes: Scenes) -> None:
     turn = scenes.around_rotation[used(scenes)]
     np.testing.assert_allclose(np.swapaxes(turn, 1, 2) @ turn - np.eye(3), 0.0, atol=1e-12)
