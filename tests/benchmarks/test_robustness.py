@@ -9,13 +9,15 @@ from typing import Any
 import pytest
 
 from benchmarks import robustness
-from envs.grasp.vector_env import GraspVectorEnv
+from envs.grasp.sensors.structured_light import StructuredLight
+from envs.grasp.settings import Camera, GraspSettings
 from trainers.evaluation import Evaluation
 from trainers.learn import DONE, MISTAKE
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import load_run
 
 RUN_FILE = Path(__file__).parents[2] / "config" / "run.yaml"
+FAULTS = robustness.load_faults()
 
 
 def report(success: float) -> dict[str, Any]:
@@ -26,38 +28,69 @@ def report(success: float) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("fault", robustness.FAULTS, ids=lambda fault: fault.text)
-def test_every_fault_is_one_that_the_environment_knows(fault: robustness.Fault) -> None:
-    assert set(fault.parameters) <= GraspVectorEnv.parameter_names
-    run = load_run(RUN_FILE, fault.overrides(), load_registries())
-    assert run.environment_parameters == fault.parameters
+def camera(fault: robustness.Fault) -> Camera:
+    run = load_run(RUN_FILE, fault.of_cameras(["depth"]), load_registries())
+    assert isinstance(run.environment.settings, GraspSettings)
+    return run.environment.settings.cameras["depth"]
 
 
-def test_there_is_a_row_for_each_fault_on_the_same_scenes(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"{fault.text}-{fault.strength}")
+def test_every_fault_is_one_that_the_run_file_knows(fault: robustness.Fault) -> None:
+    camera(fault)
+
+
+def test_a_fault_alone_leaves_every_other_one_out() -> None:
+    faultless = robustness.yaml.safe_load(robustness.FAULTS_FILE.read_text())["faultless"]
+    clean, usual = StructuredLight.model_validate(faultless), StructuredLight()
+    # Whatever is a fault by default is none here, but for what only says how a fault looks.
+    shape = {"type", "strength", "window_px", "blob_px", "dark_missing"}
+    same = {name for name, value in usual if getattr(clean, name) == value}
+    assert same == shape
+    alone = camera(next(f for f in FAULTS if f.text == "ragged edges" and f.strength == "usual"))
+    assert isinstance(alone.sensor, StructuredLight)
+    changed = {name for name, value in clean if getattr(alone.sensor, name) != value}
+    assert changed == {"jitter_px", "min_support"}
+    assert alone.sensor.jitter_px == usual.jitter_px
+
+
+def test_there_is_a_row_for_each_fault_and_simulator_on_the_same_scenes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     asked: list[tuple[Any, ...]] = []
 
     def evaluate(policy: str, *, episodes: int, seed: int, overrides: list[str], **_: Any) -> Any:
-        asked.append((policy, episodes, seed, tuple(overrides)))
-        return Evaluation(report(1.0 - 0.1 * len(overrides)), {})
+        asked.append((policy, episodes, seed, overrides[-1]))
+        return Evaluation(report(0.9), {})
 
     monkeypatch.setattr(robustness, "evaluate", evaluate)
-    assert robustness.main(["some/run", "--episodes", "7", "--seed", "3"]) == DONE
-    assert {(policy, episodes, seed) for policy, episodes, seed, _ in asked} == {("some/run", 7, 3)}
-    assert [overrides for *_, overrides in asked] == [
-        tuple(fault.overrides()) for fault in robustness.FAULTS
+    page = tmp_path / "card.md"
+    page.write_text("<!-- robustness -->\n<!-- end of robustness -->\n")
+    arguments = ["policies/grasp", "--episodes", "7", "--seed", "3", "--page", str(page)]
+    assert robustness.main([*arguments, "--simulators", "fast", "pybullet"]) == DONE
+    assert {(policy, *rest) for policy, *rest, _ in asked} == {("policies/grasp", 7, 3)}
+    assert len(asked) == 2 * len(FAULTS)
+    assert [last for *_, last in asked[:2]] == [
+        "environment.simulator=fast",
+        "environment.simulator=pybullet",
     ]
-    rows = [line for line in capsys.readouterr().out.splitlines() if "/" in line and "%" in line]
-    assert len(rows) == len(robustness.FAULTS)
-    assert re.search(r"as trained +│ 100.0% +│ 2.4 / 6.0 +│ 0.23 / 0.80", rows[0])
-    assert re.search(r"1.0% of the pixels missing +│ 90.0%", rows[2])
+    rows = page.read_text().splitlines()[3:-1]
+    assert len(rows) == 2 * len(FAULTS)
+    assert rows[0] == "| as trained |  | fast | 90.0% | 2.4 / 6.0 | 0.23 / 0.80 |"
+    assert re.search(r"│ half +│ fast +│ +90.0%", capsys.readouterr().out)
+
+
+def test_the_picture_has_a_bar_for_each_strength(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    path = tmp_path / "bars.png"
+    robustness.plot([(fault, "fast", report(0.5)) for fault in FAULTS], path)
+    assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_policy_without_first_actions_is_refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(robustness, "evaluate", lambda *_, **__: Evaluation({"reward": 1.0}, {}))
+    other = load_run(RUN_FILE.parent / "gymnasium" / "cartpole_ppo.yaml", [], load_registries())
+    monkeypatch.setattr(robustness, "find_run", lambda *_: (Path(), other))
     assert robustness.main(["some/run"]) == MISTAKE
     assert "environment: {type: grasp}" in capsys.readouterr().err
 
