@@ -78,12 +78,12 @@ class DepthImage(Box):
                 f"a depth of {max_m} m does not fit in uint16 millimetres, which end at "
                 f"{UINT16_MAX / MM_PER_M} m: lower the range's end or use the encoding 'uint8'"
             )
-        _check_sampling(height, width, sampling)
+        self.sampling = _checked_sampling(height, width, sampling)
         top, dtype = (UINT8_MAX, np.uint8) if encoding == "uint8" else (UINT16_MAX, np.uint16)
         super().__init__(0, top, shape=(height, width, 1), dtype=dtype)
         self.range_m = (min_m, max_m)
         self.encoding = encoding
-        self.pinhole, self.sampling = pinhole, sampling
+        self.pinhole = pinhole
         self.zero_m = min_m if encoding == "uint8" else 0.0
         self.codes_per_m = UINT8_MAX / (max_m - min_m) if encoding == "uint8" else float(MM_PER_M)
         low, high = ((end - self.zero_m) * self.codes_per_m for end in self.range_m)
@@ -177,15 +177,15 @@ class DepthImage(Box):
     def __repr__(self) -> str:
         """Says what the numbers mean, where a Box would list its bounds."""
         height, width, _ = self.shape
-        known = {"pinhole": self.pinhole, "sampling": self.sampling}
-        rest = "".join(f", {name}={value}" for name, value in known.items() if value is not None)
+        camera = "" if self.pinhole is None else f", pinhole={self.pinhole}"
+        sampling = _said(self.sampling)
         return (
             f"DepthImage({height}, {width}, range_m={self.range_m}, encoding={self.encoding!r}"
-            f"{rest})"
+            f"{camera}{sampling})"
         )
 
     @property
-    def _key(self) -> tuple[tuple[float, float], str, Pinhole | None, Sampling | None]:
+    def _key(self) -> tuple[tuple[float, float], str, Pinhole | None, Sampling]:
         return self.range_m, self.encoding, self.pinhole, self.sampling
 
 
@@ -203,9 +203,8 @@ class RgbImage(Box):
 
     def __init__(self, height: int, width: int, sampling: Sampling | None = None) -> None:
         _check_size(height, width)
-        _check_sampling(height, width, sampling)
+        self.sampling = _checked_sampling(height, width, sampling)
         super().__init__(0, UINT8_MAX, shape=(height, width, 3), dtype=np.uint8)
-        self.sampling = sampling
 
     def picture(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Draws one image (height, width, 3) for people: as it is."""
@@ -222,8 +221,7 @@ class RgbImage(Box):
 
     def __repr__(self) -> str:
         """Gives the size; everything else is fixed."""
-        rest = "" if self.sampling is None else f", sampling={self.sampling}"
-        return f"RgbImage({self.shape[0]}, {self.shape[1]}{rest})"
+        return f"RgbImage({self.shape[0]}, {self.shape[1]}{_said(self.sampling)})"
 
 
 def _check_size(height: int, width: int) -> None:
@@ -233,6 +231,16 @@ def _check_size(height: int, width: int) -> None:
         )
 
 
-def _check_sampling(height: int, width: int, sampling: Sampling | None) -> None:
-    if sampling is not None and (sampling.height, sampling.width) != (height, width):
+def _checked_sampling(height: int, width: int, sampling: Sampling | None) -> Sampling:
+    """The sampling; that of a whole sensor where there is none."""
+    if sampling is None:
+        return Sampling.whole(height, width)
+    if (sampling.height, sampling.width) != (height, width):
         raise ValueError(f"{sampling} takes another size than {width}x{height} (width x height)")
+    return sampling
+
+
+def _said(sampling: Sampling) -> str:
+    """For a representation: nothing where the whole sensor is taken."""
+    whole = Sampling.whole(sampling.sensor_height, sampling.sensor_width)
+    return "" if sampling == whole else f", sampling={sampling}"

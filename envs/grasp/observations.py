@@ -27,13 +27,12 @@ def observation_space(settings: GraspSettings) -> gymnasium.spaces.Dict:
     for name, camera in settings.cameras.items():
         sampled = sampling(camera)
         shape = (sampled.height, sampled.width)
-        part = None if shape == (camera.height, camera.width) else sampled
         if camera.type == "depth":
             spaces[name] = DepthImage(
-                *shape, camera.range_m, camera.encoding, pinhole(camera), part
+                *shape, camera.range_m, camera.encoding, pinhole(camera), sampled
             )
         else:
-            spaces[name] = RgbImage(*shape, part)
+            spaces[name] = RgbImage(*shape, sampled)
     if settings.privileged:
         size = POSES_AND_PROGRESS + (LIMITS if settings.privileged_limits else 0)
         spaces[PRIVILEGED] = Box(-np.inf, np.inf, (size,), np.float32)

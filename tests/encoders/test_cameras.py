@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+from dataclasses import astuple
+
+import cv2
 import numpy as np
 import pytest
 import torch
 
-from encoders.cameras import Pinhole, Sampling
+from encoders.cameras import Distortion, Pinhole, Sampling
 
 
 def test_rays_go_through_the_centres_of_the_pixels() -> None:
@@ -55,3 +58,36 @@ def test_pixels_that_a_sensor_does_not_have_are_refused(fields, message) -> None
 def test_what_is_no_camera_is_refused(fields, message) -> None:
     with pytest.raises(ValueError, match=message):
         Pinhole(*fields)
+
+
+def test_the_sensors_camera_is_found_again_from_that_of_what_is_taken() -> None:
+    sensor, taken = Pinhole(55.0, 52.0, 31.0, 26.5), Sampling(64, 48, 3, 7, 9, 8, 5)
+    found = taken.sensor_pinhole(taken.pinhole(sensor))
+    np.testing.assert_allclose(astuple(found), astuple(sensor))
+
+
+LENS = Distortion(k1=0.12, k2=-0.25, p1=0.001, p2=-0.002, k3=0.1)
+
+
+def test_the_lens_is_opencvs() -> None:
+    pinhole = Pinhole(585.0, 580.0, 322.5, 238.0)
+    points = np.random.default_rng(0).uniform([-0.5, -0.5, 0.5], [0.5, 0.5, 1.5], (50, 3))
+    seen = LENS.distorted(points / points[:, 2:])
+    # OpenCV counts from the middle of the first pixel.
+    matrix = np.array([[585.0, 0.0, 322.0], [0.0, 580.0, 237.5], [0.0, 0.0, 1.0]])
+    expected, _ = cv2.projectPoints(
+        points, np.zeros(3), np.zeros(3), matrix, np.array(astuple(LENS))
+    )
+    pixels = seen[:, :2] * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
+    np.testing.assert_allclose(pixels, expected[:, 0] + 0.5, atol=1e-9)
+
+
+def test_what_a_lens_did_is_undone() -> None:
+    rays = Pinhole(585.0, 585.0, 320.0, 240.0).rays(480, 640)
+    np.testing.assert_allclose(LENS.distorted(LENS.undistorted(rays)), rays, atol=1e-6)
+    np.testing.assert_array_equal(Distortion().undistorted(rays), rays)
+
+
+def test_a_lens_that_folds_the_image_is_refused() -> None:
+    with pytest.raises(ValueError, match="can't be undone over the whole image"):
+        Distortion(k1=-2.0).undistorted(Pinhole(200.0, 200.0, 320.0, 240.0).rays(480, 640))

@@ -67,3 +67,14 @@ def test_what_can_not_be_written_is_refused() -> None:
         space_to_plain(MultiBinary(3))
     with pytest.raises(ValueError, match="unknown type 'graph'"):
         space_from_plain({"type": "graph"})
+
+
+def test_a_policy_from_before_samplings_sees_the_whole_sensor():
+    plain = space_to_plain(DepthImage(2, 3, pinhole=Pinhole(4.0, 4.0, 1.5, 1.0)))
+    del plain["sampling"], plain["pinhole"]
+    read = space_from_plain({**plain, "focal_length_px": 4.0})
+    whole = Sampling(3, 2, 0, 0, 3, 2, 1)
+    assert read == DepthImage(2, 3, pinhole=Pinhole(4.0, 4.0, 1.5, 1.0), sampling=whole)
+    assert space_from_plain({"type": "rgb_image", "height": 2, "width": 3}) == RgbImage(
+        2, 3, sampling=whole
+    )
