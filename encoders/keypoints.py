@@ -6,8 +6,10 @@ import math
 from contextlib import AbstractContextManager, nullcontext
 from typing import Literal
 
+import numpy as np
 import torch
 from gymnasium.spaces import Box
+from numpy.typing import NDArray
 from pydantic import BaseModel, Field, PositiveInt
 from torch import nn
 from torch.nn import functional as F
@@ -91,8 +93,9 @@ class Keypoints(nn.Module):
         self.values = nn.Linear(hidden, settings.values)
         self.features_dim = count * (COORDINATES + MOMENTS + settings.values)
         self.rays: torch.Tensor
-        rays = self._middles(self._patches(_rays(self.space)))
-        self.register_buffer("rays", rays.movedim(0, -1).contiguous(), persistent=False)
+        assert self.space.pinhole is not None
+        rays = self._patch_rays(self.space.pinhole.rays(height, width))
+        self.register_buffer("rays", rays, persistent=False)
         min_m, max_m = self.space.range_m
         self._middle_m = math.sqrt(min_m * max_m)
 
@@ -107,6 +110,15 @@ class Keypoints(nn.Module):
         with torch.autocast(raw.device.type, enabled=False):
             attention = logits.float().softmax(dim=1).transpose(1, 2)
             return torch.cat(self._gather(attention, points, self.values(described.float())), 1)
+
+    def set_rays(self, rays: NDArray[np.float64]) -> None:
+        """Looks through another camera than the space's.
+
+        Args:
+            rays: (H, W, 3) the points at depth 1 that pixels' centres see: x right, y down, z
+                forward.
+        """
+        self.rays.copy_(self._patch_rays(rays))
 
     def _precision(self, device: torch.device) -> AbstractContextManager[object]:
         # Never switches off what the network around it has chosen.
@@ -150,6 +162,11 @@ class Keypoints(nn.Module):
         padded = F.pad(images[:, None], (self._padding,) * 4, mode="replicate")[:, 0]
         return padded.unfold(1, self._patch, self._stride).unfold(2, self._patch, self._stride)
 
+    def _patch_rays(self, rays: NDArray[np.float64]) -> torch.Tensor:
+        """Rays of pixels (H, W, 3) -> those of patches' middles (h, w, 3), float32."""
+        coordinates = torch.from_numpy(rays).float().permute(2, 0, 1)
+        return self._middles(self._patches(coordinates)).movedim(0, -1).contiguous()
+
     def _middles(self, patches: torch.Tensor) -> torch.Tensor:
         """The pixels (B, h, w) in the middles of patches (B, h, w, p, p)."""
         return patches[..., self._patch // 2, self._patch // 2]
@@ -163,10 +180,3 @@ def _known_camera(space: Box) -> DepthImage:
             "the depth image does not know its camera: declare its DepthImage with a pinhole"
         )
     return space
-
-
-def _rays(space: DepthImage) -> torch.Tensor:
-    """(3, H, W) the points at depth 1 that pixels' centres see: x right, y down, z forward."""
-    assert space.pinhole is not None
-    height, width, _ = space.shape
-    return torch.from_numpy(space.pinhole.rays(height, width)).float().permute(2, 0, 1)

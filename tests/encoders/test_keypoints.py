@@ -199,3 +199,13 @@ def test_a_middle_that_can_not_be_filled_in_gets_no_attention():
 def test_spaces_that_make_no_points_are_refused(space, message):
     with pytest.raises(ValueError, match=message):
         make(space)
+
+
+def test_another_camera_looks_along_its_own_rays():
+    wider = Pinhole(15.0, 17.0, 11.0, 9.0)
+    encoder = make()
+    encoder.set_rays(wider.rays(16, 24))
+    raw = torch.from_numpy(np.random.default_rng(0).integers(400, 2000, (2, 16, 24, 1), np.uint16))
+    expected = make(DepthImage(16, 24, (0.4, 2.0), pinhole=wider))(raw)
+    torch.testing.assert_close(encoder(raw), expected)
+    assert not torch.allclose(make()(raw), expected)
