@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from curricula.samplers import ParameterValue
+from envs.deployment import Deployment
 from envs.evaluation import EvaluationOption, Evaluator
 from rewards.reward import RewardTerm
 
@@ -70,6 +71,11 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
         Raises:
             ValueError: the settings don't fit together, or the rewards don't apply here.
         """
+
+    @classmethod
+    def deployment(cls, settings: BaseModel) -> Deployment:
+        """What policies are used by away from the environment; nothing need be declared."""
+        return Deployment()
 
     def set_parameters(self, parameters: Mapping[str, ParameterValue]) -> None:
         """Sets environment parameters; they hold from each environment's next reset on."""

@@ -1,4 +1,4 @@
-"""Ranges and points in settings."""
+"""Ranges in settings."""
 
 from __future__ import annotations
 
@@ -15,4 +15,3 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
 
 
 Range = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_ordered)]
-Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]

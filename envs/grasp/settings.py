@@ -8,14 +8,12 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import (
     BaseModel,
     Field,
-    FiniteFloat,
-    NonNegativeInt,
-    PositiveInt,
     field_validator,
     model_validator,
 )
 
-from envs.grasp.ranges import Point, Range
+from envs.cameras import Intrinsics, Point, SamplingSettings
+from envs.grasp.ranges import Range
 from envs.grasp.scene.blocks import MIN_BAR_M
 from envs.grasp.sensors.structured_light import Gaussian, StructuredLight
 
@@ -43,29 +41,6 @@ def check_resolution(resolution_m: float) -> float:
             f"{MIN_CONTACT_RESOLUTION_M:g} to {MAX_CONTACT_RESOLUTION_M:g} m, such as 0.005"
         )
     return resolution_m
-
-
-class Intrinsics(BaseModel, frozen=True, extra="forbid"):
-    """A pinhole camera, in pixels of the sensor; the first pixel's centre is at (0.5, 0.5)."""
-
-    fx: float = Field(gt=0.0, allow_inf_nan=False, description="Focal length over a pixel's width.")
-    fy: float = Field(
-        gt=0.0, allow_inf_nan=False, description="Focal length over a pixel's height."
-    )
-    cx: FiniteFloat = Field(description="Column coordinate of the optical axis.")
-    cy: FiniteFloat = Field(description="Row coordinate of the optical axis.")
-
-
-class SamplingSettings(BaseModel, frozen=True, extra="forbid"):
-    """Which of the sensor's pixels the network sees; part of the policy."""
-
-    crop: tuple[NonNegativeInt, NonNegativeInt, PositiveInt, PositiveInt] | None = Field(
-        None,
-        description="[left, top, width, height] in sensor pixels; null: the whole image.",
-    )
-    every: PositiveInt = Field(
-        1, description="Of the crop's columns and rows every so manyth is taken, from the first on."
-    )
 
 
 FieldOfView = Annotated[float, Field(gt=1.0, lt=170.0)]

@@ -12,11 +12,14 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
 from curricula.samplers import ParameterValue, draw
 from encoders.spaces import DepthImage
+from envs.deployment import Deployment
 from envs.environment import Environment, ObservationArrays, StepResult
 from envs.evaluation import EvaluationOption
+from envs.grasp.deployment import deployment
 from envs.grasp.episode_state import RunningEpisodes
 from envs.grasp.evaluation.evaluator import EVALUATION_OPTIONS, GraspEvaluator
 from envs.grasp.evaluation.pose_commands import PoseCommands
@@ -146,6 +149,12 @@ class GraspVectorEnv(Environment):
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the simulator."""
         self._simulator.close()
+
+    @classmethod
+    def deployment(cls, settings: BaseModel) -> Deployment:
+        """See `Environment.deployment`."""
+        assert isinstance(settings, GraspSettings)
+        return deployment(settings)
 
     # -- training's interface --------------------------------------------------------------------
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from encoders.cameras import Pinhole, Sampling
+from envs.cameras import euler_rotations, look_at
 from envs.grasp.batch import Batch
 from envs.grasp.sensors.structured_light import StructuredLight
 from envs.grasp.settings import Camera
@@ -81,11 +82,7 @@ def sensor_pinhole(camera: Camera) -> Pinhole:
 
 def sampling(camera: Camera) -> Sampling:
     """Which of the sensor's pixels are in the image."""
-    left, top, width, height = camera.sampling.crop or (0, 0, camera.width, camera.height)
-    every = camera.sampling.every
-    return Sampling(
-        camera.width, camera.height, left, top, -(-width // every), -(-height // every), every
-    )
+    return camera.sampling.of_sensor(camera.width, camera.height)
 
 
 def pinhole(camera: Camera) -> Pinhole:
@@ -95,36 +92,6 @@ def pinhole(camera: Camera) -> Pinhole:
 
 def _focal_length_px(pixels: int, fov_deg: float) -> float:
     return pixels / 2.0 / float(np.tan(np.radians(fov_deg) / 2.0))
-
-
-def look_at(position_m: Floats, target_m: Floats, roll_rad: float = 0.0) -> Floats:
-    """Rotation (3, 3) of a camera at `position_m` that looks at `target_m`.
-
-    Upright without `roll_rad`, which turns it about its optical axis, clockwise seen from behind.
-    """
-    forward = np.asarray(target_m, float) - position_m
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    if np.linalg.norm(right) < 1e-9:  # looking straight down or up: the image's right is -y
-        right = np.array([0.0, -1.0, 0.0])
-    right = right / np.linalg.norm(right)
-    upright = np.stack([right, np.cross(forward, right), forward], axis=1)
-    return upright @ euler_rotations(np.array([[0.0, 0.0, roll_rad]]))[0]
-
-
-def euler_rotations(angles_rad: Floats) -> Floats:
-    """Rotations (n, 3, 3) by angles (n, 3) about x, then y, then z."""
-    sine, cosine = np.sin(angles_rad), np.cos(angles_rad)
-    zero, one = np.zeros(len(angles_rad)), np.ones(len(angles_rad))
-
-    def matrix(*rows: list[Floats]) -> Floats:
-        return np.moveaxis(np.array(rows), -1, 0)
-
-    (sx, sy, sz), (cx, cy, cz) = sine.T, cosine.T
-    about_x = matrix([one, zero, zero], [zero, cx, -sx], [zero, sx, cx])
-    about_y = matrix([cy, zero, sy], [zero, one, zero], [-sy, zero, cy])
-    about_z = matrix([cz, -sz, zero], [sz, cz, zero], [zero, zero, one])
-    return about_z @ about_y @ about_x
 
 
 def sample_views(
