@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium
+from pydantic import BaseModel
 from torch import nn
 
 from trainers.common.errors import UserError
@@ -14,6 +15,8 @@ from trainers.networks.network import NetworkSettings
 from trainers.networks.observations import is_frame
 from trainers.runfile.registry import Registry
 from trainers.runfile.settings import Component
+
+Model = TypeVar("Model", bound=BaseModel)
 
 DEFAULT_IMAGE_ENCODER = "simple"
 DEFAULT_VECTOR_ENCODER = "vector"
@@ -54,6 +57,22 @@ def network_factory(
     for name in encoders:
         factory.check_name(name, "encoders")
     return factory
+
+
+def in_float32(settings: Model) -> Model:
+    """Settings whose networks calculate in float32 throughout, with the same weights.
+
+    Args:
+        settings: of an encoder or an algorithm: what says bfloat16 in them, or in a part of them,
+            is changed.
+    """
+    changed: dict[str, Any] = {}
+    for name, value in settings:
+        if isinstance(value, BaseModel):
+            changed[name] = in_float32(value)
+        elif value == "bfloat16":
+            changed[name] = "float32"
+    return settings.model_copy(update=changed)
 
 
 def _default_encoder(

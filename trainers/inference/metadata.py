@@ -12,6 +12,7 @@ import gymnasium
 from pydantic import BaseModel, ValidationError
 
 from encoders.saved_spaces import space_from_plain, space_to_plain
+from envs.deployment import Deployment
 from envs.environment import Environment
 from trainers.common.errors import UserError
 from trainers.runfile.registry import Entry, Registries
@@ -36,6 +37,7 @@ class _File(BaseModel, frozen=True, extra="forbid"):
     privileged: list[str]
     encoders: dict[str, Need]
     trainer: Need
+    deployment: Deployment | None = None
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,8 @@ class Metadata:
         privileged: names of the observations that only a critic may see.
         encoders: by the name of the observation, as far as the run file names them.
         trainer: the algorithm.
+        deployment: what its policies are used by away from the environment; None where it was saved
+            before environments declared it.
     """
 
     observation_space: gymnasium.spaces.Dict
@@ -55,6 +59,7 @@ class Metadata:
     privileged: frozenset[str]
     encoders: Mapping[str, Need]
     trainer: Need
+    deployment: Deployment | None = None
 
     @classmethod
     def of_run(cls, run: RunSettings, registries: Registries, env: Environment) -> Metadata:
@@ -66,6 +71,7 @@ class Metadata:
             env.privileged,
             {name: _need(c.name, encoders.get(c.name)) for name, c in run.encoders.items()},
             _need(run.trainer.name, trainers.get(run.trainer.name)),
+            run.environment.cls.deployment(run.environment.settings),
         )
 
     def to_json(self) -> str:
@@ -81,6 +87,7 @@ class Metadata:
             privileged=sorted(self.privileged),
             encoders=dict(self.encoders),
             trainer=self.trainer,
+            deployment=self.deployment,
         )
         return json.dumps(file.model_dump(), indent=2) + "\n"
 
@@ -103,6 +110,7 @@ class Metadata:
             frozenset(file.privileged),
             file.encoders,
             file.trainer,
+            file.deployment,
         )
 
     def check_plugins(self, registries: Registries, folder: Path) -> None:

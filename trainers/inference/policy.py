@@ -17,10 +17,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from envs.deployment import Deployment
 from envs.environment import Environment
 from trainers.common.devices import resolve_device
 from trainers.common.errors import UserError, first_lines
-from trainers.inference.construction import network_factory
+from trainers.inference.construction import in_float32, network_factory
 from trainers.inference.inputs import checked
 from trainers.inference.metadata import Metadata, read_metadata
 from trainers.networks.actions import to_environment
@@ -28,7 +29,7 @@ from trainers.networks.observations import to_tensors
 from trainers.networks.policy_network import PolicyNetwork
 from trainers.networks.recurrent import Sequences
 from trainers.runfile.registry import load_registries, plugin_manager
-from trainers.runfile.settings import load_policy, load_run
+from trainers.runfile.settings import Component, load_policy, load_run
 from trainers.saving.checkpoint import Loaded
 from trainers.saving.run_folder import CONFIGURATION, find_checkpoint, run_folder
 
@@ -74,6 +75,7 @@ class Policy:
         results_dir: str | Path = "results",
         device: str = "cpu",
         seed: int = 0,
+        full_precision: bool = False,
     ) -> Self:
         """Loads an exported policy, a run (its best checkpoint) or a checkpoint's folder.
 
@@ -82,6 +84,7 @@ class Policy:
             results_dir: where runs are kept.
             device: torch's name of where the network is to be.
             seed: of what `predict` draws when it is not deterministic.
+            full_precision: calculate in float32, even if it was trained with bfloat16.
 
         Raises:
             UserError: there is no such policy or device, it is damaged, a plugin that it needs is
@@ -91,7 +94,7 @@ class Policy:
         loaded = find_checkpoint(str(folder_or_run), Path(results_dir))
         folder = run_folder(loaded.path)
         metadata = find_metadata(folder)
-        network = _network(loaded, folder, metadata).to(found_device).eval()
+        network = _network(loaded, folder, metadata, full_precision).to(found_device).eval()
         return cls(network, metadata.observation_space, metadata.action_space, seed)
 
     @torch.no_grad()
@@ -169,18 +172,46 @@ def find_metadata(folder: Path) -> Metadata:
         return Metadata.of_run(run, registries, env)
 
 
-def _network(loaded: Loaded, folder: Path, metadata: Metadata) -> PolicyNetwork:
+def complete_metadata(folder: Path) -> Metadata:
+    """Metadata of a policy with what its environment declares for use away from it.
+
+    Where the policy was saved before environments did, the class of its environment is asked; one
+    that is not installed here has declared nothing.
+
+    Args:
+        folder: of the run, or of an exported policy.
+
+    Raises:
+        UserError: see `find_metadata`.
+    """
+    metadata = find_metadata(folder)
+    if metadata.deployment is not None:
+        return metadata
+    try:
+        environment = load_run(folder / CONFIGURATION, [], load_registries()).environment
+    except UserError:
+        return replace(metadata, deployment=Deployment())
+    return replace(metadata, deployment=environment.cls.deployment(environment.settings))
+
+
+def _network(
+    loaded: Loaded, folder: Path, metadata: Metadata, full_precision: bool
+) -> PolicyNetwork:
     registries = load_registries(plugin_manager(PLUGINS))
     metadata.check_plugins(registries, folder)
     settings = load_policy(folder / CONFIGURATION, registries)
+    encoders, trainer = settings.encoders, settings.trainer
+    if full_precision:
+        encoders = {name: _in_float32(encoder) for name, encoder in encoders.items()}
+        trainer = _in_float32(trainer)
     factory = network_factory(
         metadata.observation_space,
         metadata.action_space,
         metadata.privileged,
-        settings.encoders,
+        encoders,
         registries.encoders,
     )
-    network: PolicyNetwork = settings.trainer.cls.build_policy(factory, settings.trainer.settings)
+    network: PolicyNetwork = trainer.cls.build_policy(factory, trainer.settings)
     try:
         network.load_state_dict(loaded.weights)
     except RuntimeError as error:
@@ -189,3 +220,7 @@ def _network(loaded: Loaded, folder: Path, metadata: Metadata) -> PolicyNetwork:
             f"{first_lines(error, 3)}"
         ) from error
     return network
+
+
+def _in_float32(component: Component) -> Component:
+    return replace(component, settings=in_float32(component.settings))

@@ -43,13 +43,20 @@ class ActionScaling(nn.Module):
 
 def to_environment(actions: Tensor, space: gymnasium.Space[Any]) -> NDArray[Any]:
     """Actions as the environment takes them: an array, within a Box, or from a Discrete's start."""
-    values = actions.cpu().numpy()
+    return within(actions.cpu(), space).numpy()
+
+
+def within(actions: Tensor, space: gymnasium.Space[Any]) -> Tensor:
+    """The same as a tensor, for actions on the CPU."""
     match space:
         case gymnasium.spaces.Box():
-            return np.clip(values, space.low, space.high)
+            low, high = (
+                torch.as_tensor(bound, dtype=actions.dtype) for bound in (space.low, space.high)
+            )
+            return actions.clamp(low, high)
         case gymnasium.spaces.Discrete():
-            return values + space.start
-    return values
+            return actions + int(space.start)
+    return actions
 
 
 def _bounded(space: gymnasium.Space[Any]) -> gymnasium.spaces.Box:

@@ -169,6 +169,10 @@ class ActorCritic(PolicyNetwork):
         unused = hidden_state.new_zeros(len(hidden_state), size)
         return actions, torch.cat([hidden_state, unused], dim=1)
 
+    def exploration_std(self) -> Tensor | None:
+        """See `PolicyNetwork.exploration_std`."""
+        return None if self.log_std is None else self._log_std(self.log_std).exp()
+
     def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
         """Features of U frames by name, (U, H, W, C)."""
         critic = None if self.critic is None else self.critic.encode_frames(frames)
@@ -196,8 +200,12 @@ class ActorCritic(PolicyNetwork):
         outputs = self.action_head(hidden)
         if self.log_std is None:
             return Categorical(outputs)
-        # std = min_std + exp(log_std): a floor that, unlike a clamp, always lets gradients through.
-        return DiagonalGaussian(outputs, torch.logaddexp(self.log_std, self._min_log_std))
+        return DiagonalGaussian(outputs, self._log_std(self.log_std))
+
+    def _log_std(self, learned: Tensor) -> Tensor:
+        """Logarithms of the standard deviations (A,)."""
+        # std = min_std + exp(learned): a floor that, unlike a clamp, always lets gradients through.
+        return torch.logaddexp(learned, self._min_log_std)
 
     def _value(self, hidden: Tensor) -> Tensor:
         value: Tensor = self.value_head(hidden).squeeze(-1)

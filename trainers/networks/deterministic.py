@@ -149,6 +149,12 @@ class DeterministicPolicy(OffPolicyNetwork):
             actions = (actions + self._final_sigma * noise).clamp(-1.0, 1.0)
         return self.scale(actions), self.initial_state(len(actions))
 
+    def exploration_std(self) -> Tensor:
+        """See `PolicyNetwork.exploration_std`."""
+        # Half the distance between the bounds is one unit of the network's actions.
+        one = next(self.parameters()).new_ones(self.scale.size)
+        return self._final_sigma * (self.scale(one) - self.scale(0.0 * one))
+
     def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
         """See `OffPolicyNetwork.encode_frames`."""
         return self.online.encode_frames(frames)

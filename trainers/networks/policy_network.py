@@ -41,5 +41,13 @@ class PolicyNetwork(nn.Module, ABC):
             after them.
         """
 
+    def exploration_std(self) -> Tensor | None:
+        """Standard deviations (A,) of what is added to the best actions where actions are drawn.
+
+        In the units of the environment's space, to whose bounds the sum is held. None: actions are
+        drawn in another way.
+        """
+        return None
+
     def update_statistics(self, vectors: dict[str, Tensor]) -> None:
         """Shows vector observations (B, n) by name to the encoders that standardise."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -77,14 +77,25 @@ class Recurrent(nn.Module):
             Outputs of all steps (B, features_dim), and the hidden states (S, m) after the last
             ones.
         """
+        before = self._layer_state(sequences.hidden_state)
+        if len(sequences.lengths) == len(vectors):  # each by itself, as whoever acts has them
+            outputs, after = self.layer(vectors[None], before)
+            return outputs[0], self._hidden_state(after)
         rows, counts, order = _in_step(sequences.lengths)
         rows, order = rows.to(vectors.device), order.to(vectors.device)
         packed = PackedSequence(vectors[rows], counts, order, order.argsort())
-        parts = sequences.hidden_state[None].chunk(self._parts, dim=-1)
-        before = tuple(part.contiguous() for part in parts)
-        outputs, after = self.layer(packed, before if self._parts > 1 else before[0])
-        hidden_state = torch.cat(after, dim=-1) if self._parts > 1 else after
-        return outputs.data[rows.argsort()], hidden_state[0]
+        packed_outputs, after = self.layer(packed, before)
+        return packed_outputs.data[rows.argsort()], self._hidden_state(after)
+
+    def _layer_state(self, hidden_state: Tensor) -> Any:
+        """A hidden state (S, m) as torch's layer takes it."""
+        parts = tuple(part.contiguous() for part in hidden_state[None].chunk(self._parts, dim=-1))
+        return parts if self._parts > 1 else parts[0]
+
+    def _hidden_state(self, after: Any) -> Tensor:
+        """The inverse of `_layer_state`."""
+        whole: Tensor = torch.cat(after, dim=-1) if self._parts > 1 else after
+        return whole[0]
 
 
 def number_sequences(done: NDArray[np.bool_], length: int) -> NDArray[np.int64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -16,9 +17,10 @@ import yaml
 from gymnasium.spaces import Box, Dict, Discrete
 from pydantic import BaseModel
 
+from envs.deployment import Deployment, Meaning, Quantity
 from trainers.common.errors import UserError
 from trainers.inference.metadata import FILE
-from trainers.inference.policy import Policy
+from trainers.inference.policy import Policy, complete_metadata, find_metadata
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import to_tensors
@@ -172,6 +174,43 @@ def test_a_run_of_before_there_were_metadata_still_loads(
     monkeypatch.setattr("trainers.inference.policy.load_registries", lambda *_: registries)
     actions, _ = Policy.load(folder).predict(seen)
     np.testing.assert_array_equal(actions, expected)
+
+
+DECLARED = Deployment(
+    meaning=Meaning(name="speed", quantities=(Quantity(name="v", low=0, high=2, label="v"),) * 2)
+)
+
+
+def test_what_an_environment_declares_is_saved_or_asked_for(
+    saved: Save, monkeypatch: pytest.MonkeyPatch, registries: Registries
+) -> None:
+    target = registries.environments.get("target").cls
+    monkeypatch.setattr(target, "deployment", classmethod(lambda cls, settings: DECLARED))
+    folder, _ = saved()
+    assert complete_metadata(folder).deployment == DECLARED
+    content = json.loads((folder / FILE).read_text())
+    del content["deployment"]  # as those of before have it
+    (folder / FILE).write_text(json.dumps(content))
+    assert find_metadata(folder).deployment is None
+    monkeypatch.setattr("trainers.inference.policy.load_registries", lambda *_: registries)
+    assert complete_metadata(folder).deployment == DECLARED
+    monkeypatch.undo()  # the toy is not installed
+    assert complete_metadata(folder).deployment == Deployment()
+
+
+@pytest.mark.parametrize("trainer_type", ["ppo", "ddpg"])
+def test_what_was_trained_in_bfloat16_may_calculate_in_float32(
+    saved: Save, trainer_type: str
+) -> None:
+    lowered = {"precision": "bfloat16"}
+    folder, session = saved(trainer_type=trainer_type, network_settings=lowered)
+    seen = observations_of(session)
+    exact, _ = Policy.load(folder, full_precision=True).predict(seen)
+    rough, _ = Policy.load(folder).predict(seen)
+    assert 0.0 < np.abs(exact - rough).max() < 0.05
+    path = folder / CONFIGURATION
+    path.write_text(path.read_text().replace("bfloat16", "float32"))
+    np.testing.assert_array_equal(Policy.load(folder).predict(seen)[0], exact)
 
 
 def test_an_environment_asked_for_its_spaces_need_not_count_itself(

@@ -73,3 +73,17 @@ def test_targets_see_the_same_statistics_wherever_the_policy_went(
     policy.update_statistics({"joints": torch.tensor([[3.0, 5.0, 7.0], [5.0, 5.0, 9.0]])})
     means = [values.tolist() for name, values in policy.named_buffers() if name.endswith("mean")]
     assert means == [[4.0, 5.0, 8.0]] * 4  # actor and critic, online and target
+
+
+def test_exploration_is_told_in_the_units_of_the_space(
+    make_factory: Callable[..., NetworkFactory],
+) -> None:
+    actions = Box(np.array([-2.0, 0.0], np.float32), np.array([1.0, 8.0], np.float32))
+    factory = make_factory({"joints": JOINTS}, action_space=actions)
+    settings = DeterministicSettings(hidden_units=4)
+    policy = DeterministicPolicy(factory, settings, tau=0.1, final_sigma=0.01)
+    np.testing.assert_allclose(policy.exploration_std(), [0.015, 0.04], rtol=1e-6)
+    observations = Observations({}, {"joints": torch.zeros(20_000, 3)})
+    with torch.no_grad():
+        drawn, _ = policy.act(observations, deterministic=False, generator=torch.Generator())
+    np.testing.assert_allclose(drawn.std(0), policy.exploration_std(), rtol=0.03)
