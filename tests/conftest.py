@@ -28,15 +28,17 @@ from rewards.reward import RewardTerm
 from trainers import run as run_module
 from trainers.algorithms.ppo import PPO
 from trainers.algorithms.trpo import TRPO
+from trainers.export import main as export
 from trainers.hookspecs import hookimpl
 from trainers.inference.construction import network_factory
-from trainers.learn import main
+from trainers.learn import DONE, main
 from trainers.networks.factory import NetworkFactory
 from trainers.runfile.registry import BUILT_IN_PLUGINS, Registries, load_registries, plugin_manager
 from trainers.runfile.settings import Component, RunSettings, load_run
 from trainers.session import Session
 
 PICTURE_SIDE_PX = 8
+SHIPPED = Path(__file__).parents[1] / "policies" / "grasp"
 
 
 class ToySettings(BaseModel, frozen=True, extra="forbid"):
@@ -534,6 +536,14 @@ def learn(
         return Learned(code, captured.out, captured.err, results_dir)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def shipped_onnx(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The policy in policies/grasp as an ONNX file."""
+    path = tmp_path_factory.mktemp("shipped") / "policy.onnx"
+    assert export([str(SHIPPED), str(path)]) == DONE
+    return path
 
 
 @pytest.fixture(autouse=True)

@@ -76,7 +76,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         parents=[generic],
         epilog=None if policy else "POLICY --help lists the options of its environment, too.",
     )
-    parser.add_argument("policy", help="a run (its best checkpoint) or a checkpoint's folder")
+    parser.add_argument(
+        "policy", help="a run (its best checkpoint), a checkpoint's folder or an ONNX file"
+    )
     parser.add_argument(
         "overrides",
         nargs="*",

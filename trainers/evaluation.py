@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +18,7 @@ from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import EpisodeBatch, concatenate
 from trainers.inference.metadata import read_metadata
+from trainers.inference.onnx_policy import OnnxPolicy, is_onnx
 from trainers.inference.policy import Policy
 from trainers.reporting.figures import (
     Metrics,
@@ -27,7 +29,8 @@ from trainers.reporting.figures import (
     summaries,
 )
 from trainers.runfile.registry import load_registries
-from trainers.runfile.settings import RunSettings, load_run
+from trainers.runfile.settings import RunSettings, load_run, load_run_document
+from trainers.runfile.yaml_document import parse
 from trainers.saving.evaluation_folder import EVALUATION, EvaluationFolder
 from trainers.saving.run_folder import CONFIGURATION, find_run_folder
 from trainers.session import blaming_parameters, build_environment, final_parameters
@@ -59,6 +62,18 @@ class ActingPolicy(Protocol):
         """
 
 
+class SavedPolicy(ActingPolicy, Protocol):
+    """A policy that says what it is for.
+
+    Attributes:
+        observation_space: the observations that acting needs.
+        action_space: of one environment.
+    """
+
+    observation_space: gymnasium.spaces.Dict
+    action_space: gymnasium.Space[Any]
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """Result of an evaluation.
@@ -86,7 +101,7 @@ def evaluate(
     """Evaluates a saved policy on the last lesson's task.
 
     Args:
-        policy: a run's folder or id, or a checkpoint's folder.
+        policy: a run's folder or id, a checkpoint's folder, or an ONNX file.
         episodes: see `evaluate_policy`; None: what the environment is judged by.
         seed: of the episodes, which no training run has seen; below `SEED_LIMIT`.
         overrides: `KEY=VALUE`s on top of the run's own configuration; the policy's networks stay
@@ -102,7 +117,7 @@ def evaluate(
         EnvironmentFailure, NonFiniteError: the environment broke down.
     """
     folder, run = find_run(policy, overrides, results_dir)
-    acting = Policy.load(policy, results_dir=results_dir, device=run.device, seed=seed)
+    acting = _load(policy, results_dir, run.device, seed)
     count = episodes or run.environment.cls.evaluation_episodes
     with closing(evaluation_environment(run, count)) as env, ExitStack() as stack:
         _check_spaces(acting, env)
@@ -123,19 +138,30 @@ def evaluate(
 
 
 def find_run(policy: str, overrides: Sequence[str], results_dir: Path) -> tuple[Path, RunSettings]:
-    """Folder and settings of the run a saved policy comes from; its weights are not read.
+    """Folder and settings of the run a saved policy comes from; its weights are not used.
 
     Raises:
         UserError: there is no such policy, a plugin that it needs is not installed here, or its
             configuration is not valid.
     """
-    folder, registries = find_run_folder(policy, results_dir), load_registries()
+    registries = load_registries()
+    if is_onnx(policy):
+        text = OnnxPolicy.load(policy).configuration
+        document = parse(text, f"{policy}: {CONFIGURATION}", lines=True)
+        return Path(policy).parent, load_run_document(document, overrides, registries)
+    folder = find_run_folder(policy, results_dir)
     if metadata := read_metadata(folder):
         metadata.check_plugins(registries, folder)
     return folder, load_run(folder / CONFIGURATION, overrides, registries)
 
 
-def _check_spaces(policy: Policy, env: Environment) -> None:
+def _load(policy: str, results_dir: Path, device: str, seed: int) -> SavedPolicy:
+    if is_onnx(policy):
+        return OnnxPolicy.load(policy, seed)
+    return Policy.load(policy, results_dir=results_dir, device=device, seed=seed)
+
+
+def _check_spaces(policy: SavedPolicy, env: Environment) -> None:
     """Refuses an environment that shows or takes something else than the policy was trained on.
 
     Raises:

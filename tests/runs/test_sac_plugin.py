@@ -22,6 +22,7 @@ from trainers import run as run_module
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner
 from trainers.export import main as export
+from trainers.inference.onnx_policy import OnnxPolicy
 from trainers.inference.policy import Policy
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import Observations
@@ -284,7 +285,10 @@ def test_a_run_taken_up_again_ends_exactly_as_one_that_was_not_stopped(
 
 
 def test_an_exported_policy_acts_and_names_the_plugin_where_that_is_missing(
-    learn_sac: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    learn_sac: Callable[..., Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     results, folder = learn_sac().results, tmp_path / "policy"
     assert export(["toy", str(folder), "--results-dir", str(results)]) == 0
@@ -296,6 +300,13 @@ def test_an_exported_policy_acts_and_names_the_plugin_where_that_is_missing(
     assert np.abs([best, drawn]).max() <= 1.0
     assert not np.array_equal(best, drawn)
     np.testing.assert_array_equal(best, policy.predict(goals)[0])
+    file = tmp_path / "policy.onnx"
+    assert export(["toy", str(file), "--results-dir", str(results)]) == 0
+    said = capfd.readouterr().out  # the toy is not installed
+    assert "on 100 observations drawn at random (" in said
+    assert "unknown environment 'target'" in said
+    told, _ = OnnxPolicy.load(file).predict(goals)
+    np.testing.assert_allclose(told, best, atol=1e-5)
     without = [path for path in sys.path if not list(Path(path).glob("ventosa_sac_plugin*"))]
     assert len(without) < len(sys.path)
     monkeypatch.setattr(sys, "path", without)

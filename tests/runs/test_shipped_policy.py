@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from trainers.evaluation import evaluate
+from trainers.evaluation import FIRST_SEED, evaluate, evaluation_environment, find_run
+from trainers.inference.fitting import load_raw_policy
+from trainers.inference.onnx_policy import OnnxPolicy
 
 POLICY = Path(__file__).parents[2] / "policies" / "grasp"
 LARGEST_BYTES = 10_000_000
@@ -41,3 +45,29 @@ def test_the_card_quotes_the_evaluation() -> None:
         assert f"{told[key]:.1%}".replace("%", " %") in card, key
     for error, factor, digits in (("position_error_m", 1000, 1), ("yaw_error_deg", 1, 2)):
         assert f"{told[error]['median'] * factor:.{digits}f} / " in card
+
+
+def test_the_onnx_file_says_what_the_shipped_policy_says(shipped_onnx: Path) -> None:
+    file, policy = OnnxPolicy.load(shipped_onnx), load_raw_policy(str(POLICY))
+    _, run = find_run(str(POLICY), [], Path("results"))
+    with closing(evaluation_environment(run, 64)) as env:
+        seen, _ = env.reset(seed=FIRST_SEED)
+    off = []
+    for row in range(64):
+        raw = {
+            name: part.spread(seen[name][row : row + 1]) for name, part in file.raw_inputs.items()
+        }
+        off.append(abs(file.run(raw)["pose"] - policy.run(raw)["pose"])[0])
+    largest = np.max(off, axis=0)
+    assert (largest[:3] < 0.0001).all()  # m
+    assert np.degrees(largest[3]) < 0.01
+
+
+def test_the_onnx_file_has_the_figures_of_the_shipped_policy(shipped_onnx: Path) -> None:
+    expected = evaluate(str(POLICY), episodes=128, seed=7).report
+    found = evaluate(str(shipped_onnx), episodes=128, seed=7).report
+    for rate in ("first_action_success", "success", "collision_rate"):
+        # One scene may be at the edge: the policy itself calculates with bfloat16.
+        assert found[rate] == pytest.approx(expected[rate], abs=1.5 / 128), rate
+    for error in ("position_error_m", "yaw_error_deg"):
+        assert found[error]["median"] == pytest.approx(expected[error]["median"], rel=0.1), error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,60 @@ def test_an_exported_policy_has_the_figures_of_its_run(results: Path, tmp_path: 
     }
     own = evaluate(str(folder), episodes=8, seed=0)
     assert own == evaluate("toy", episodes=8, seed=0, results_dir=results)
+
+
+@pytest.fixture
+def darts(
+    learn: Callable[..., Any],
+    write_run: Callable[..., Path],
+    registries: Registries,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Path:
+    """The results of a run `toy` whose first actions are judged, and whose others are drawn."""
+    monkeypatch.setattr(evaluation, "load_registries", lambda: registries)
+    learned = learn(write_run("darts"))
+    assert learned.code == DONE, learned.errors
+    found: Path = learned.results
+    return found
+
+
+def test_an_onnx_file_has_the_figures_of_its_run(
+    darts: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert export(darts, tmp_path / "mine", "--format", "onnx") == DONE
+    file = tmp_path / "mine" / "policy.onnx"
+    said = capfd.readouterr().out.splitlines()
+    assert said[0] == f"{file}: goal -> action, unbounded_action"
+    assert said[1].startswith("largest difference to torch, on 4 observations of its environment: ")
+    assert "on 96 observations drawn at random: action " in said[2]
+    assert re.fullmatch(r"\d+\.\d\d ms an observation, on one thread \(median\)", said[3])
+    assert len(said) == 4
+    own = evaluate(str(file), episodes=8, seed=0).report
+    expected = evaluate("toy", episodes=8, seed=0, results_dir=darts).report
+    assert flat(own) == pytest.approx(flat(expected), abs=1e-5)
+
+    assert export(darts, file) == MISTAKE
+    assert f"{file.parent}: policy.onnx would be replaced" in capfd.readouterr().err
+    assert main([str(file), str(tmp_path / "other"), "--results-dir", str(darts)]) == MISTAKE
+    assert "neither a run nor a checkpoint" in capfd.readouterr().err
+    changed = ["environment.episode_steps=1"]
+    assert evaluate(str(file), episodes=8, overrides=changed).report["episode_length"] == 1
+
+
+def flat(report: dict[str, Any]) -> dict[str, Any]:
+    """Figures, those with parts by part."""
+    return {
+        f"{key}.{part}": number
+        for key, value in report.items()
+        for part, number in (value.items() if isinstance(value, dict) else [("", value)])
+    }
+
+
+def test_a_folder_has_no_camera(
+    results: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert export(results, tmp_path / "mine", "--unit", "5000") == MISTAKE
+    assert "--camera and --unit are for --format onnx" in capfd.readouterr().err
 
 
 def test_a_run_can_begin_with_an_exported_policy(

@@ -20,13 +20,14 @@ FILES = [
     for path in sorted((ROOT / "trainers").rglob("*.py"))
     if path.relative_to(ROOT).as_posix() not in ELSEWHERE
 ]
-# Not target, table, pixel and touched: networks, terminals, images and memory have them, too.
+# Not target, table, pixel, touched and camera: networks, terminals, images, memory and commands
+# have them, too.
 WORDS = set(
     re.findall(
         r"\w+",
         "grasp grasped grasping pick picked picker suction cup tool tooltip robot arm kuka joint "
         "yaw pose lateral gap block workspace scene collision collided simulator pybullet urdf "
-        "camera depth rgb mm deg degree metre",
+        "depth rgb mm deg degree metre",
     )
 )
 SHARED_NAMES = {"success", "num_envs"}

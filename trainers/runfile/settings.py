@@ -159,7 +159,13 @@ def load_run(path: Path, overrides: Sequence[str], registries: Registries) -> Ru
     Raises:
         SettingsError: with everything that is wrong, where it stands, and what is allowed.
     """
-    document = read(path)
+    return load_run_document(read(path), overrides, registries)
+
+
+def load_run_document(
+    document: Document, overrides: Sequence[str], registries: Registries
+) -> RunSettings:
+    """Override and validate what a run file says; see `load_run`."""
     for override in overrides:
         document.override(override)
     return _Sections(document, registries).run()
