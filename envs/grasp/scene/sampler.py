@@ -13,7 +13,7 @@ from envs.grasp.scene import surroundings
 from envs.grasp.scene.dark import draw_dark
 from envs.grasp.scene.placement import place_blocks, rules
 from envs.grasp.scene.surroundings import SurroundingRules
-from envs.grasp.sensors.camera import CameraPoses, sample_views
+from envs.grasp.sensors.camera import CameraPoses, sample_views, with_dark
 from envs.grasp.sensors.structured_light import StructuredLight
 from envs.grasp.settings import GraspSettings, Randomize
 from envs.grasp.simulators.thread_pool import ThreadPool
@@ -153,7 +153,7 @@ class SceneSampler:
         dark, missing = draw_dark(
             sensor, self._settings, rng, boxes, scenes.block_position_m, scenes.block_yaw_rad
         )
-        return view.with_arrays({"dark": dark, "dark_missing": missing})
+        return with_dark(view, dark, missing)
 
     def check(self, scenes: Scenes) -> None:
         """Refuses scenes of a task that draws other arrays.

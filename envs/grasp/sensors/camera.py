@@ -37,8 +37,8 @@ class CameraPoses(Batch):
         sensor_strength: (n,) factor on a structured-light camera's faults.
         depth_scale_error: (n,) its depths' relative error.
         depth_offset_m: (n,) its depths' common error.
-        dark: (n, K, 4, 3) boxes in the world frame that hold dark or shiny surfaces: the centre,
-            and three axes over the half extents.
+        dark: (n, K, 4, 3) boxes that hold dark or shiny surfaces, in camera axes: the centre, and
+            three axes over the half extents.
         dark_missing: (n, K) share of the pixels that it misses on each.
     """
 
@@ -142,6 +142,19 @@ def _with_faults(
             "depth_offset_m": rng.uniform(-sensor.depth_offset_m, sensor.depth_offset_m, n),
         }
     )
+
+
+def with_dark(views: CameraPoses, boxes: Floats, missing: Floats) -> CameraPoses:
+    """The same cameras with dark boxes (n, K, 4, 3), given in the world frame, in what they see.
+
+    Args:
+        views: n cameras.
+        boxes: centres, and axes over half extents.
+        missing: (n, K) share of the pixels that they miss on each.
+    """
+    centers = boxes[:, :, :1] - views.position_m[:, None, None]
+    local = np.concatenate([centers, boxes[:, :, 1:]], axis=2) @ views.rotation[:, None]
+    return views.with_arrays({"dark": local, "dark_missing": missing})
 
 
 def overviews(n: int, **other: Any) -> CameraPoses:

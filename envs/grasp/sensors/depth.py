@@ -13,16 +13,9 @@ from numpy.typing import NDArray
 
 from encoders.spaces import NOTHING_SEEN, DepthImage
 from envs.grasp.sensors.camera import CameraPoses
-from envs.grasp.sensors.matching import (
-    NO_MATCHING,
-    Desk,
-    Limits,
-    Matching,
-    desk,
-    match,
-    matching_of,
-)
+from envs.grasp.sensors.matching import NO_MATCHING, Limits, Matching, matching_of
 from envs.grasp.sensors.noise import FAST, fill_normals, fill_uniforms
+from envs.grasp.sensors.windows import Desk, desk, match
 from envs.grasp.settings import MAX_NOISE_SIGMA_M
 from envs.grasp.simulators.kernels.worlds import kernel
 
@@ -150,7 +143,7 @@ def sense(
         bench: room to work.
         codes: (P,) written.
     """
-    if not len(sensor.matching.strength):
+    if len(sensor.matching.strength) == 0:
         _sense_gaussian(true, inverse, sensor, row, bench.normals, bench.uniforms, codes)
         return
     if not inverse:

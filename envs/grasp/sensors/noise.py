@@ -80,17 +80,19 @@ def fill_normals(seed: np.uint64, out: NDArray[np.float32]) -> None:
 
 
 @kernel(fastmath=FAST)
-def fill_bits(seed: np.uint64, out: NDArray[np.uint32]) -> None:
+def fill_bits(seed: np.uint64, first: int, out: NDArray[np.uint32]) -> None:
     """Fills an array of even length with random bits.
 
     Args:
         seed: uint64, of which every one gives other numbers.
-        out: (2 k,) whose halves are the two numbers of each pair.
+        first: number of the first pair that is wanted.
+        out: (2 k,) written, pair after pair.
     """
-    half = np.uint32(len(out) // 2)
     key = (np.uint32(seed), np.uint32(seed >> np.uint64(32)))
-    for i in range(half):
-        out[i], out[half + i] = threefry(key, (np.uint32(i), BITS))
+    counter = np.uint32(first)
+    for i in range(np.uint32(len(out) // 2)):
+        one, other = threefry(key, (np.uint32(counter + i), BITS))
+        out[np.uint32(2) * i], out[np.uint32(2) * i + np.uint32(1)] = one, other
 
 
 @kernel(fastmath=FAST)

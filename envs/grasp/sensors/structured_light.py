@@ -2,7 +2,7 @@
 
 A projector beside the camera throws a pattern; the camera finds each window of it again, some
 pixels aside: the disparity, d = f b / z. What it measures errs for that reason: see
-`StructuredLight`, and `envs.grasp.sensors.matching` for how an image comes about.
+`StructuredLight`, and `envs.grasp.sensors.windows` for how an image comes about.
 
 Sources: Nguyen, Izadi and Lovell, "Modeling Kinect sensor noise for improved 3D reconstruction and
 tracking", 3DIMPVT 2012 (axial and lateral noise); Handa, Whelan, McDonald and Davison, "A benchmark
@@ -20,6 +20,7 @@ from pydantic import BaseModel, Field, field_validator
 from envs.grasp.ranges import Range
 
 MAX_STRENGTH = 10.0
+MIN_BASELINE_M = 0.001
 RIGHT_ANGLE_DEG = 90.0
 
 
@@ -58,18 +59,18 @@ class StructuredLight(BaseModel, frozen=True, extra="forbid"):
         description="Side of the window that is matched: over it noise is correlated.",
     )
     jitter_px: float = Field(
-        0.5,
+        0.7,
         ge=0.0,
         le=8.0,
         description="Sigma of the sideways error, which makes edges ragged (Nguyen et al.: 0.5 to "
         "0.8).",
     )
     min_support: float = Field(
-        0.6,
+        0.55,
         ge=0.5,
         le=1.0,
         description="Share of a window that must lie on one surface for a match: what is nearer to "
-        "an edge is missing.",
+        "an edge is missing, up to one pixel of the image.",
     )
     axial_sigma_m: float = Field(
         0.0012, ge=0.0, le=0.1, description="Sigma of the depth at 0.4 m (Nguyen et al.)."
@@ -90,7 +91,7 @@ class StructuredLight(BaseModel, frozen=True, extra="forbid"):
         0.1, ge=0.0, le=1.0, description="Probability of a block to be dark or shiny."
     )
     dark_patches: int = Field(
-        2, ge=0, le=16, description="Dark or shiny places on table and blocks, at most."
+        3, ge=0, le=16, description="Dark or shiny places on table and blocks, at most."
     )
     dark_missing: Range = Field(
         (0.2, 0.8), description="Share of the pixels that is missing on what is dark, each drawn."
@@ -99,7 +100,7 @@ class StructuredLight(BaseModel, frozen=True, extra="forbid"):
         16.0, ge=1.0, le=256.0, description="Size of the holes in what is dark or at an incidence."
     )
     speck_fraction: float = Field(
-        0.005, ge=0.0, le=1.0, description="Probability of any single pixel to be missing."
+        0.001, ge=0.0, le=1.0, description="Probability of any single pixel to be missing."
     )
     depth_scale: float = Field(
         0.01, ge=0.0, le=0.2, description="Half range of the depths' relative error, drawn."
@@ -117,6 +118,16 @@ class StructuredLight(BaseModel, frozen=True, extra="forbid"):
         description="Half range of the optical axis's error, as a part of the image's sides, "
         "drawn.",
     )
+
+    @field_validator("baseline_m")
+    @classmethod
+    def _baseline_is_possible(cls, value: float) -> float:
+        if abs(value) < MIN_BASELINE_M:
+            raise ValueError(
+                f"without a baseline there is no disparity: it is {MIN_BASELINE_M:g} m at least, "
+                "or less than 0 for a projector on the left"
+            )
+        return value
 
     @field_validator("strength")
     @classmethod
