@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from curricula.samplers import ParameterValue
+from envs.grasp.sensors.structured_light import MAX_STRENGTH
 from envs.grasp.settings import MAX_NOISE_SIGMA_M, GraspSettings
 
 GOAL_PARAMETERS = ("lateral_limit_m", "vertical_limit_m", "gap_limit_m", "yaw_limit_deg")
-SENSOR_PARAMETERS = ("noise_sigma_m", "missing_fraction")
+SENSOR_PARAMETERS = ("noise_sigma_m", "missing_fraction", "sensor_strength")
 YAW_LIMIT = "block_yaw_limit_deg"
 
 
@@ -65,6 +66,9 @@ def parameter_ranges(settings: GraspSettings) -> dict[str, ParameterRange]:
             0.0, MAX_NOISE_SIGMA_M, f"a sigma is within 0 and {MAX_NOISE_SIGMA_M:g} m"
         ),
         "missing_fraction": ParameterRange(0.0, 1.0, "a probability is within 0 and 1"),
+        "sensor_strength": ParameterRange(
+            0.0, MAX_STRENGTH, f"a strength is within 0 and {MAX_STRENGTH:g}"
+        ),
         YAW_LIMIT: _block_yaw_limits(settings.randomize.block_yaw_deg),
     }
 

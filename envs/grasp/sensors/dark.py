@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from encoders.spaces import NOTHING_SEEN
-from envs.grasp.sensors.fields import Field, quantile
+from envs.grasp.sensors.fields import Field
 from envs.grasp.sensors.noise import FAST
 from envs.grasp.simulators.kernels.worlds import Floats, dot, kernel, triple
 
@@ -27,7 +27,7 @@ def darken(
     pinhole: tuple[float, float, float, float],
     boxes: Floats,
     box: int,
-    share: float,
+    least: float,
     holes: Field,
     size: tuple[int, int, int],
     codes: Codes,
@@ -40,7 +40,7 @@ def darken(
         pinhole: fx, fy, cx, cy.
         boxes: (K, 4, 3) in camera axes: centres, and axes over half extents.
         box: which of them.
-        share: of the pixels on it that is missing.
+        least: number of the holes' field from which on a pixel is seen.
         holes: random field.
         size: W, H, margin.
         codes: (H * S,) written.
@@ -48,7 +48,7 @@ def darken(
     fx, fy, cx, cy = pinhole
     width, height, margin = size
     center = triple(boxes, box, 0)
-    limit, stride = np.int16(quantile(share)), width + 2 * margin
+    limit, stride = np.int16(least), width + 2 * margin
     first_column, end_column = _span(boxes, box, 0, fx, cx, width)
     first_row, end_row = _span(boxes, box, 1, fy, cy, height)
     a, b, c = triple(boxes, box, 1), triple(boxes, box, 2), triple(boxes, box, 3)

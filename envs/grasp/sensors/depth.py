@@ -15,6 +15,7 @@ from encoders.spaces import NOTHING_SEEN, DepthImage
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.sensors.matching import NO_MATCHING, Limits, Matching, matching_of
 from envs.grasp.sensors.noise import FAST, fill_normals, fill_uniforms
+from envs.grasp.sensors.structured_light import MAX_STRENGTH
 from envs.grasp.sensors.windows import Desk, desk, match
 from envs.grasp.settings import MAX_NOISE_SIGMA_M
 from envs.grasp.simulators.kernels.worlds import kernel
@@ -22,6 +23,12 @@ from envs.grasp.simulators.kernels.worlds import kernel
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.float32]
 Codes = NDArray[np.uint16]
+
+MOST = {
+    "noise_sigma_m": MAX_NOISE_SIGMA_M,
+    "missing_fraction": 1.0,
+    "sensor_strength": MAX_STRENGTH,
+}
 
 
 class Sensor(NamedTuple):
@@ -76,10 +83,10 @@ def sensor_of(views: CameraPoses, space: DepthImage, seeds: NDArray[np.uint64]) 
         seeds: (n,) of the pictures.
 
     Raises:
-        ValueError: a camera's noise or share of missing pixels is not of shape (n,), or not within
-            what the settings allow.
+        ValueError: a camera's noise, share of missing pixels or strength of faults is not of shape
+            (n,), or not within what the settings allow.
     """
-    for name, most in (("noise_sigma_m", MAX_NOISE_SIGMA_M), ("missing_fraction", 1.0)):
+    for name, most in MOST.items():
         values = np.asarray(getattr(views, name))
         if values.shape != np.shape(seeds) or not ((values >= 0.0) & (values <= most)).all():
             raise ValueError(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,7 @@ Codes = NDArray[np.uint16]
 
 # Makes other 16 bits out of 16.
 SCRAMBLE = np.uint16(40503)
+WORDS = 65536
 
 
 @kernel()
@@ -21,11 +24,12 @@ def displace(
     stride: int,
     step: int,
     limit: float,
+    edge: float,
     field: Field,
     apart: int,
     moved: Codes,
 ) -> None:
-    """Moves pixels a step sideways and up or down, where two fields leave +-limit.
+    """Moves pixels beside edges a step sideways and up or down, where two fields leave +-limit.
 
     Args:
         codes: (P,) of rows one after the other, with a step or more of columns on both sides that
@@ -33,6 +37,7 @@ def displace(
         stride: from one row to the next.
         step: in pixels.
         limit: on the fields.
+        edge: codes by which a pixel lies out of line with both its neighbours at an edge.
         field: random numbers,
         apart: of which so far from each other two are independent: from there on they move pixels
             sideways, from twice as far on up and down.
@@ -40,13 +45,13 @@ def displace(
     """
     above, size = step * stride, len(codes)
     first, last = np.uint32(above), np.uint32(size - stride + above)
-    beyond, short = np.int16(limit), np.int16(-limit)
-    _choose(codes, step, size - 2 * step, field, apart + step, beyond, short, moved, above + step)
+    limits = (np.int16(limit), np.int16(-limit), np.uint16(edge))
+    _choose(codes, step, size - 2 * step, field, apart + step, limits, moved, above + step)
     for i in range(np.uint32(above)):
         column = i % np.uint32(stride)
         moved[i] = moved[first + column]
         moved[first + np.uint32(size) + i] = moved[last + column]
-    _choose(moved, above, size, field, 2 * apart, beyond, short, codes, 0)
+    _choose(moved, above, size, field, 2 * apart, limits, codes, 0)
 
 
 @kernel(counts=False)
@@ -56,33 +61,33 @@ def _choose(
     size: int,
     field: Field,
     begin: int,
-    beyond: np.int16,
-    short: np.int16,
+    limits: tuple[np.int16, np.int16, np.uint16],
     target: Codes,
     end: int,
 ) -> None:
-    """Of each pixel what is at it, a step ahead (field beyond a limit) or a step behind."""
+    """Of each pixel what is at it; at edges, a step ahead (field beyond a limit) or behind."""
+    beyond, short, edge = limits
     random, to = np.uint32(begin), np.uint32(end)
-    middle, front = np.uint32(step), np.uint32(2 * step)
+    middle, front, both = np.uint32(step), np.uint32(2 * step), np.uint16(edge + edge)
     for i in range(np.uint32(size)):
-        number, behind, here, ahead = (
-            field[random + i],
-            source[i],
-            source[middle + i],
-            source[front + i],
-        )
-        here = ahead if number > beyond else here
-        target[to + i] = behind if number < short else here
+        number, behind = field[random + i], source[i]
+        here, ahead = source[middle + i], source[front + i]
+        # Numbers under 0 are great ones, so that this is |bend| > edge.
+        bend = np.uint16(behind + ahead - here - here)
+        is_edge = np.uint16(bend + edge) > both
+        here = ahead if is_edge & (number > beyond) else here
+        target[to + i] = behind if is_edge & (number < short) else here
 
 
 @kernel(counts=False)
 def add_specks(words: Words, probability: float, codes: Codes) -> None:
     """Makes single pixels missing, by random words."""
-    if probability <= 0.0:
+    last = math.floor(WORDS * min(probability, 1.0)) - 1
+    if last < 0:
         return
-    last = np.uint16(65536.0 * min(probability, 1.0) - 1.0)
+    most = np.uint16(last)
     for i in range(np.uint32(len(codes))):
-        is_missing = np.uint16(words[i] * SCRAMBLE) <= last
+        is_missing = np.uint16(words[i] * SCRAMBLE) <= most
         codes[i] = np.uint16(NOTHING_SEEN) if is_missing else codes[i]
 
 

@@ -20,6 +20,8 @@ Field = NDArray[np.int16]
 # White noise is the sum of two random bytes, less its mean, times this: so large that what is
 # rounded does not matter, so small that sums of four boxes never leave 16 bits.
 FIELD_SCALE = 4
+# In sigmas: so that even the least number is not under the quantile of 0.
+BEYOND = 1.0
 # So many words come from the generator at once.
 TOGETHER = 4
 FIELD_SIGMA = FIELD_SCALE * math.sqrt((256.0**2 - 1.0) / 6.0)
@@ -90,12 +92,20 @@ def _average_boxes(source: Field, side: int, stride: int, count: int, target: Fi
 
 
 @kernel(counts=False)
-def quantile(probability: float) -> float:
+def quantile(probability: float, side: int) -> float:
     """The number that a field is under with a probability, nearly; for 0 and 1 none and all are.
 
-    Source: Shore, "Simple approximations for the inverse cumulative function, the density function
-    and the loss integral of the normal distribution", Applied Statistics 1982.
+    White noise is triangular, and all averages are next to normal. For these see Shore, "Simple
+    approximations for the inverse cumulative function, the density function and the loss integral
+    of the normal distribution", Applied Statistics 1982.
+
+    Args:
+        probability: within 0 and 1.
+        side: of the field.
     """
     tail = min(probability, 1.0 - probability)
-    sigmas = 5.5556 * (1.0 - (tail / (1.0 - tail)) ** 0.1186)
+    if side == 1:
+        sigmas = math.sqrt(6.0) * (1.0 - math.sqrt(2.0 * tail)) + BEYOND * (tail <= 0.0)
+    else:
+        sigmas = 5.5556 * (1.0 - (tail / (1.0 - tail)) ** 0.1186)
     return FIELD_SIGMA * math.copysign(sigmas, probability - 0.5)

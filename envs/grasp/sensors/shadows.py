@@ -21,8 +21,8 @@ TAPS = 4
 
 
 def reach(width: int) -> int:
-    """How far, at least the width, some passes look: a power of `TAPS`."""
-    columns = TAPS
+    """How far, at least the width, some passes look: a power of `TAPS`, more than one pass does."""
+    columns = TAPS * TAPS
     while columns < width:
         columns *= TAPS
     return columns

@@ -37,6 +37,8 @@ MEAN_EXCESS = 1.0 / math.sqrt(2.0 * math.pi)
 # The sigma of what is uniform within +-1/2: by so much a shadow's end is rounded.
 DITHER = 1.0 / math.sqrt(12.0)
 NEAREST_M = 0.4
+# So far from its neighbours' line noise hardly brings a pixel.
+EDGE_M = 0.03
 # Shadows are looked for as far as depths may err beyond the range.
 BEYOND_RANGE = 1.1
 
@@ -207,8 +209,9 @@ def _match_rows(
     _darken_boxes(matching, picture, first, holes, desk)
     sigma = strength * matching.jitter
     step = max(math.ceil(sigma), 1)
-    limit = -quantile(MEAN_EXCESS * sigma / step)
-    displace(desk.codes, stride, step, limit, noise, matching.window, desk.moved)
+    limit = -quantile(MEAN_EXCESS * sigma / step, matching.window)
+    edge = max(EDGE_M * limits.codes_per_m, 1.0)
+    displace(desk.codes, stride, step, limit, edge, noise, matching.window, desk.moved)
     add_specks(desk.words, strength * matching.speck + matching.missing[picture], desk.codes)
 
 
@@ -242,7 +245,7 @@ def _darken_boxes(matching: Matching, picture: int, first: int, holes: Field, de
                 camera,
                 matching.dark[picture],
                 box,
-                share,
+                quantile(share, matching.blob),
                 holes,
                 size,
                 desk.codes,
@@ -268,7 +271,7 @@ def _lens(matching: Matching, picture: int, first: int) -> Lens:
 def _losses(matching: Matching, picture: int) -> Losses:
     strength = matching.strength[picture]
     begins, ends = matching.cosines
-    lack = quantile(min(strength * matching.lack, 1.0))
+    lack = quantile(min(strength * matching.lack, 1.0), matching.window)
     if strength <= 0.0:
         return Losses(
             np.float32(matching.edge),

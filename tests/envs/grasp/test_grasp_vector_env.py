@@ -554,6 +554,39 @@ def test_pixels_go_missing_by_parameter_and_by_setting(make: MakeEnv) -> None:
     np.testing.assert_array_equal(first["depth"][kept], whole["depth"][kept])
 
 
+def test_a_structured_light_cameras_faults_are_scaled_by_parameter_and_by_setting(
+    make: MakeEnv,
+) -> None:
+    sensor = {"type": "structured_light", "strength": (0.5, 2.0)}
+    camera = {"type": "depth", "width": 32, "height": 24, "sensor": sensor}
+    env = make(64, cameras={"depth": camera})
+    faulty, _ = env.reset(seed=0)
+    strength = env.state_dict()["views"]["depth"]["sensor_strength"]
+    assert 0.5 <= strength.min() < 0.6
+    assert 1.9 < strength.max() <= 2.0
+    env.set_parameters({"sensor_strength": 0.0})
+    whole, _ = env.reset(seed=0)  # the same scenes and cameras
+    assert not env.state_dict()["views"]["depth"]["sensor_strength"].any()
+    seen = whole["depth"] > 0
+    missing = ((faulty["depth"] == 0) & seen).sum((1, 2, 3)) / seen.sum((1, 2, 3))
+    assert missing.all()
+    assert missing[strength > 1.5].mean() > 1.5 * missing[strength < 1.0].mean()
+
+
+def test_a_structured_light_cameras_episodes_go_on_where_they_were_left(make: MakeEnv) -> None:
+    camera = {"type": "depth", "width": 32, "height": 24, "sensor": "structured_light"}
+    options = {"cameras": {"depth": camera}, "frame_grab": False, "episode_steps": 3}
+    env = make(4, **options)
+    env.reset(seed=0)
+    play(env, 2, 0)
+    skeleton, arrays = flatten(env.state_dict())
+    arrays = _copied(arrays)
+    expected = play(env, 5, 1)
+    resumed = make(4, seed=99, **options)
+    resumed.load_state_dict(unflatten(skeleton, arrays))
+    same(play(resumed, 5, 1), expected)
+
+
 def test_a_drawn_share_of_missing_pixels_is_one(make: MakeEnv) -> None:
     env = make(32)
     wide = GaussianParameters(mean=0.5, st_dev=2.0)

@@ -50,6 +50,8 @@ def test_every_parameter_has_a_range() -> None:
         ("missing_fraction", 2.0, "2: a probability is within 0 and 1"),
         ("missing_fraction", uniform(-0.1, 0.5), r"-0\.1 to 0\.5: "),
         ("missing_fraction", float("nan"), "nan: "),
+        ("sensor_strength", -0.5, r"-0\.5: a strength is within 0 and 10"),
+        ("sensor_strength", uniform(0.0, 11.0), "0 to 11: "),
     ],
 )
 def test_values_that_mean_nothing_are_refused(name: str, value: ParameterValue, words: str) -> None:
@@ -68,6 +70,7 @@ def test_values_that_mean_nothing_are_refused(name: str, value: ParameterValue, 
         ("lateral_limit_m", 1e-9),
         ("noise_sigma_m", uniform(0.0, 1.0)),
         ("missing_fraction", uniform(0.0, 1.0)),
+        ("sensor_strength", uniform(0.0, 10.0)),
         *((name, WILD) for name in RANGES),
     ],
 )

@@ -191,9 +191,11 @@ def test_a_sensor_that_makes_no_sense_is_refused() -> None:
         ("missing_fraction", -0.1),
         ("missing_fraction", 1.1),
         ("missing_fraction", np.nan),
+        ("sensor_strength", -1.0),
+        ("sensor_strength", 10.5),
     ],
 )
-def test_a_sigma_under_0_and_a_share_that_is_none_are_refused(name: str, value: float) -> None:
+def test_what_the_settings_would_not_allow_is_refused(name: str, value: float) -> None:
     poses = fixed_views(Camera(type="depth", width=4, height=3), 2)
     wrong = poses.with_arrays({name: np.array([0.0, value])})
     with pytest.raises(ValueError, match=f"{name} must be within 0 and 1"):
