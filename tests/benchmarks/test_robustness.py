@@ -43,7 +43,7 @@ def test_a_fault_alone_leaves_every_other_one_out() -> None:
     faultless = robustness.yaml.safe_load(robustness.FAULTS_FILE.read_text())["faultless"]
     clean, usual = StructuredLight.model_validate(faultless), StructuredLight()
     # Whatever is a fault by default is none here, but for what only says how a fault looks.
-    shape = {"type", "strength", "window_px", "blob_px", "dark_missing"}
+    shape = {"type", "strength", "baseline_m", "window_px", "blob_px", "dark_missing"}
     same = {name for name, value in usual if getattr(clean, name) == value}
     assert same == shape
     alone = camera(next(f for f in FAULTS if f.text == "ragged edges" and f.strength == "usual"))

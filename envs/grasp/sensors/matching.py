@@ -41,6 +41,7 @@ class Matching(NamedTuple):
         dark_missing: (n, K) share of the pixels that is missing on them.
         disparity_m: focal length times baseline: disparity = this / depth.
         side: of the projector, 1: on the right, -1: on the left.
+        shadow: whether it casts shadows, 1 or 0.
         step: of the disparity.
         jitter: sigma of the sideways error.
         lack: how far from an edge a window has too little of one surface.
@@ -65,6 +66,7 @@ class Matching(NamedTuple):
     dark_missing: Floats
     disparity_m: float
     side: int
+    shadow: float
     step: float
     jitter: float
     lack: float
@@ -109,6 +111,7 @@ def matching_of(views: CameraPoses) -> Matching:
         dark_missing=np.ascontiguousarray(views.dark_missing, np.float64),
         disparity_m=pinhole(views.camera).fx * abs(settings.baseline_m),
         side=1 if settings.baseline_m > 0.0 else -1,
+        shadow=float(settings.shadow),
         step=settings.disparity_step_px / every,
         jitter=jitter,
         lack=(settings.min_support - 0.5) * settings.window_px / every,
@@ -137,6 +140,7 @@ NO_MATCHING = Matching(
     dark_missing=np.empty((0, 0)),
     disparity_m=0.0,
     side=1,
+    shadow=0.0,
     step=0.0,
     jitter=0.0,
     lack=0.0,

@@ -44,7 +44,12 @@ class StructuredLight(BaseModel, frozen=True, extra="forbid"):
         ge=-1.0,
         le=1.0,
         description="How far to the right of the camera the projector is; less than 0: to the "
-        "left. What only the camera sees is missing: a shadow beside near things.",
+        "left.",
+    )
+    shadow: bool = Field(
+        True,
+        description="Whether what the projector does not see is missing: a shadow beside near "
+        "things.",
     )
     disparity_step_px: float = Field(
         0.125,

@@ -186,10 +186,9 @@ def _match_rows(
     nearest = place(
         true, first, disparity_m, width, margin, matching.side, desk.disparity, desk.keys
     )
-    longest = strength * (nearest - disparity_m / farthest_m)
-    hidden = find_shadows(
-        size, matching.side * strength, longest, desk.keys, desk.hidden, desk.other
-    )
+    shadow = matching.shadow * strength
+    longest = shadow * (nearest - disparity_m / farthest_m)
+    hidden = find_shadows(size, matching.side * shadow, longest, desk.keys, desk.hidden, desk.other)
     measure(
         desk.disparity,
         stride,
@@ -291,7 +290,7 @@ def _losses(matching: Matching, picture: int) -> Losses:
         np.float32(begins),
         np.float32(begins - 0.5 * ramp),
         np.float32(ramp * DITHER / FIELD_SIGMA),
-        np.float32(0.5 / strength),
+        np.float32(0.5 / (matching.shadow * strength)),
         np.float32(DITHER / (strength * FIELD_SIGMA)),
     )
 

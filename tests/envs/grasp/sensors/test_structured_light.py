@@ -104,6 +104,10 @@ def test_a_sampled_shadow_is_as_wide_on_average(every: int) -> None:
     assert np.ptp(widths) <= 2 * every
 
 
+def test_without_shadows_nothing_is_missing_beside_a_box() -> None:
+    assert shoot(box_before_wall(), **IDEAL | {"shadow": False}).all()
+
+
 def test_a_shadow_grows_with_the_strength() -> None:
     missing = shoot(box_before_wall(), count=4, **IDEAL | {"strength": (2.0, 2.0)}) == 0
     assert missing[:, 60:420].sum(2).mean() == pytest.approx(32.9, abs=0.2)
