@@ -29,16 +29,27 @@ def reach(width: int) -> int:
 
 
 @kernel(counts=False, fastmath=FAST)
+def greatest(numbers: Pixels, begin: int, count: int) -> float:
+    """The greatest of some numbers, of which none is less than 0."""
+    first, most = np.uint32(begin), np.int32(0)
+    for i in range(np.uint32(count)):
+        # It has the greatest bits, too, and whole numbers are compared in vectors.
+        bits = np.float32(numbers[first + i]).view(np.int32)
+        most = bits if bits > most else most
+    return float(np.int32(most).view(np.float32))
+
+
+@kernel(counts=False, fastmath=FAST)
 def place(
     true: Pixels,
     first_row: int,
     disparity_m: float,
     width: int,
     margin: int,
-    side: int,
+    lower: float,
     disparity: Pixels,
     keys: Pixels,
-) -> float:
+) -> None:
     """Puts disparities into rows with margins, and a row above and below: all repeat what is next.
 
     Args:
@@ -47,29 +58,28 @@ def place(
         disparity_m: disparity = this * inverse depth.
         width: W.
         margin: columns beside the picture, on either side.
-        side: where the projector is, 1: on the right, -1: on the left.
+        lower: by how much the keys of each row are lower than those of the last: with more than
+            the greatest disparity, a row hides nothing of the row before it.
         disparity: ((H + 2) * S,) written; S = W + 2 * margin.
-        keys: (more than H * S,) the same, in the middle, without the rows above and below. Here
-            each row is so much lower than the one before (or after it) that it hides nothing there.
-
-    Returns:
-        The greatest disparity.
+        keys: (more than H * S,) the same, in the middle, without the rows above and below.
     """
     scale, stride = np.float32(disparity_m), width + 2 * margin
     height = len(disparity) // stride - 2
-    start, low, nearest, before = (len(keys) - height * stride) // 2, 0.0, 0.0, 0.0
+    start = (len(keys) - height * stride) // 2
     for row in range(height):
-        end, source = (row + 1) * stride, (first_row + row) * width
-        most = float(_scale(true, source, scale, width, disparity, end + margin))
-        for column in range(margin):
-            disparity[end + column] = disparity[end + margin]
-            disparity[end + stride - 1 - column] = disparity[end + margin + width - 1]
-        low, before, nearest = low + max(most, before), most, max(most, nearest)
-        _lower(disparity, end, np.float32(side * low), stride, keys, start + row * stride)
+        source, low = np.uint32((first_row + row) * width), np.float32(lower * row)
+        here, key = (row + 1) * stride + margin, start + row * stride + margin
+        to, to_key = np.uint32(here), np.uint32(key)
+        for column in range(np.uint32(width)):
+            value = scale * true[source + column]
+            disparity[to + column], keys[to_key + column] = value, value - low
+        for column in range(1, margin + 1):
+            before, behind = disparity[here], disparity[here + width - 1]
+            disparity[here - column], disparity[here + width - 1 + column] = before, behind
+            keys[key - column], keys[key + width - 1 + column] = before - low, behind - low
     for column in range(stride):
         disparity[column] = disparity[stride + column]
         disparity[(height + 1) * stride + column] = disparity[height * stride + column]
-    return nearest
 
 
 @kernel(counts=False, fastmath=FAST)
@@ -89,30 +99,6 @@ def _holds(true: Pixels, begin: int, count: int, limit: np.float32) -> bool:
     for i in range(np.uint32(count)):
         found |= np.int32(true[start + i] >= limit)
     return bool(found > 0)
-
-
-@kernel(counts=False, fastmath=FAST)
-def _scale(
-    source: Pixels, begin: int, scale: np.float32, count: int, target: Pixels, end: int
-) -> np.float32:
-    """Scales some numbers, none less than 0, and returns the greatest."""
-    first, to, most = np.uint32(begin), np.uint32(end), np.int32(0)
-    for i in range(np.uint32(count)):
-        value = np.float32(scale * source[first + i])
-        target[to + i] = value
-        # The greatest has the greatest bits, too, and whole numbers are compared in vectors.
-        bits = value.view(np.int32)
-        most = bits if bits > most else most
-    return np.int32(most).view(np.float32)
-
-
-@kernel(counts=False, fastmath=FAST)
-def _lower(
-    source: Pixels, begin: int, low: np.float32, count: int, target: Pixels, end: int
-) -> None:
-    first, to = np.uint32(begin), np.uint32(end)
-    for i in range(np.uint32(count)):
-        target[to + i] = source[first + i] - low
 
 
 @kernel()

@@ -37,7 +37,7 @@ class StructuredLight(BaseModel, frozen=True, extra="forbid"):
     strength: Range = Field(
         (1.0, 1.0),
         description="Factor on all of the faults below, drawn at every reset; 0: none of them. The "
-        "environment parameter sensor_strength sets it, too.",
+        "environment parameter sensor_strength takes its place, but for focal lengths and centre.",
     )
     baseline_m: float = Field(
         0.075,
@@ -61,7 +61,7 @@ class StructuredLight(BaseModel, frozen=True, extra="forbid"):
         7.0,
         ge=1.0,
         le=64.0,
-        description="Side of the window that is matched: over it noise is correlated.",
+        description="Side of the window that is matched: over it noise and edges are correlated.",
     )
     jitter_px: float = Field(
         0.7,
@@ -93,7 +93,7 @@ class StructuredLight(BaseModel, frozen=True, extra="forbid"):
         "do.",
     )
     dark_blocks: float = Field(
-        0.1, ge=0.0, le=1.0, description="Probability of a block to be dark or shiny."
+        0.1, ge=0.0, le=1.0, description="Probability that a block is dark or shiny."
     )
     dark_patches: int = Field(
         3, ge=0, le=16, description="Dark or shiny places on table and blocks, at most."
@@ -105,7 +105,7 @@ class StructuredLight(BaseModel, frozen=True, extra="forbid"):
         16.0, ge=1.0, le=256.0, description="Size of the holes in what is dark or at an incidence."
     )
     speck_fraction: float = Field(
-        0.001, ge=0.0, le=1.0, description="Probability of any single pixel to be missing."
+        0.001, ge=0.0, le=1.0, description="Probability that any single pixel is missing."
     )
     depth_scale: float = Field(
         0.01, ge=0.0, le=0.2, description="Half range of the depths' relative error, drawn."

@@ -25,7 +25,7 @@ from envs.grasp.sensors.fields import (
     quantile,
 )
 from envs.grasp.sensors.matching import Limits, Matching
-from envs.grasp.sensors.shadows import find_shadows, place, rows_with
+from envs.grasp.sensors.shadows import find_shadows, greatest, place, rows_with
 from envs.grasp.sensors.surfaces import GRAZING_SIGMA_M, Errors, Lens, Losses, measure
 from envs.grasp.simulators.kernels.worlds import kernel
 
@@ -183,9 +183,10 @@ def _match_rows(
     size = len(desk.codes)
     fill_white(seed, first * stride, desk.bits, desk.words, desk.white)
     noise, holes = _fields(matching, size, desk)
-    nearest = place(
-        true, first, disparity_m, width, margin, matching.side, desk.disparity, desk.keys
-    )
+    rows = size // stride
+    nearest = disparity_m * greatest(true, first * width, rows * width)
+    lower = matching.side * (nearest + 1.0)
+    place(true, first, disparity_m, width, margin, lower, desk.disparity, desk.keys)
     shadow = matching.shadow * strength
     longest = shadow * (nearest - disparity_m / farthest_m)
     hidden = find_shadows(size, matching.side * shadow, longest, desk.keys, desk.hidden, desk.other)

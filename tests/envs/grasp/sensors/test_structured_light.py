@@ -13,7 +13,7 @@ from encoders.spaces import DepthImage
 from envs.grasp.robot.urdf import load_robot
 from envs.grasp.sensors.camera import CameraPoses, pinhole, sample_views
 from envs.grasp.sensors.depth import sense_depth
-from envs.grasp.sensors.shadows import find_shadows, place, reach
+from envs.grasp.sensors.shadows import find_shadows, greatest, place, reach
 from envs.grasp.sensors.structured_light import StructuredLight
 from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.fast import FastSimulator
@@ -142,8 +142,9 @@ def test_shadows_are_those_of_every_pair_of_pixels(
     )
     side = 1 if factor > 0 else -1
     true = (disparity / 7.0).astype(np.float32).ravel()
-    nearest = place(true, 0, 7.0, width, margin, side, placed, keys)
+    nearest = 7.0 * greatest(true, 0, width * height)
     assert nearest == pytest.approx(disparity.max(), rel=1e-6)
+    place(true, 0, 7.0, width, margin, side * (nearest + 1.0), placed, keys)
     shown = np.pad(disparity, ((1, 1), (margin, margin)), mode="edge")
     np.testing.assert_allclose(placed.reshape(shown.shape), shown, rtol=1e-6)
     found = find_shadows(height * stride, factor, abs(factor) * nearest, keys, *room)
