@@ -30,7 +30,8 @@ class Matching(NamedTuple):
     """The matching of n pictures; lengths in sensor pixels are divided by the sampling's `every`.
 
     Attributes:
-        width, height, margin: of the pictures, and columns beside them.
+        width, height, margin: of the pictures, and columns beside them: no pixel is moved farther,
+            whatever its picture's strength, as where random numbers go depends on it.
         window, blob: pixels over which noise and holes are correlated, powers of two.
         reach: see `envs.grasp.sensors.shadows.reach`.
         pinhole: (n, 4) fx, fy, cx, cy in pixels of the picture.
@@ -98,7 +99,7 @@ def matching_of(views: CameraPoses) -> Matching:
     return Matching(
         width=taken.width,
         height=taken.height,
-        margin=max(math.ceil(jitter * np.max(views.sensor_strength, initial=0.0)), 1),
+        margin=max(math.ceil(jitter * settings.strength[1]), 1),
         window=power_of_two(settings.window_px / every),
         blob=power_of_two(settings.blob_px / every),
         reach=reach(taken.width),

@@ -89,7 +89,6 @@ def measure(
     side: int,
     keys: Pixels,
     hidden: Pixels,
-    before: int,
     columns: Pixels,
     rows: Pixels,
     noise: Field,
@@ -107,26 +106,20 @@ def measure(
         disparity: (P + 2 * stride,) true ones, with the rows above and below.
         stride: from one row to the next.
         side: of the projector, 1: on the right, -1: on the left.
-        keys: of the pixels, and
-        hidden: what hides them, see `envs.grasp.sensors.shadows`,
-        before: after so many others.
+        keys: (P or more,) see `envs.grasp.sensors.shadows`.
+        hidden: (P or more,) keys that are in the shadow.
         columns: (P,) of the pixels.
         rows: (P,) of the pixels.
-        noise: a random field.
-        holes: another.
+        noise: (P or more,) a random field.
+        holes: (P or more,) another.
         lens: where rays go.
         losses: when a pixel is missing.
         errors: of the others.
         codes: written.
     """
-    fx, fy, per_fx, per_fy, first_x, first_y = lens
     edge, lack, most, middle, spread, slope, dither = losses
-    second, linear, constant, grazing, step, per_step = errors[:6]
-    level, zero, low, high, first, last = errors[6:]
-    none, one, steps = np.float32(0.0), np.float32(1.0), step > np.float32(0.0)
-    here, below, key = np.uint32(stride), np.uint32(2 * stride), np.uint32(before)
+    here, below, to_next = np.uint32(stride), np.uint32(2 * stride), np.uint32(stride + side)
     to_left, to_right = np.uint32(stride - 1), np.uint32(stride + 1)
-    to_next = np.uint32(stride + side)
     for i in range(np.uint32(len(codes))):
         d, left, right = disparity[i + here], disparity[i + to_left], disparity[i + to_right]
         up, down = disparity[i], disparity[i + below]
@@ -135,28 +128,50 @@ def measure(
         across = forward if abs(forward) < abs(backward) else backward
         along = downward if abs(downward) < abs(upward) else upward
         jump = max(abs(forward - backward), abs(downward - upward))
-        # The ray is (x, y, 1). Where d is affine in u = fx x and v = fy y, the normal over its
-        # distance, times f b, is (fx d_u, fy d_v, d - u d_u - v d_v).
-        x, y = per_fx * columns[i] + first_x, per_fy * rows[i] + first_y
-        normal_x, normal_y = fx * across, fy * along
-        normal_z = d - x * normal_x - y * normal_y
-        # cos^2 of the incidence is (n . ray)^2 = d^2, over the squares of both lengths.
-        square = d * d
-        squares = (normal_x * normal_x + normal_y * normal_y + normal_z * normal_z) * (
-            x * x + y * y + one
-        )
+        squares = _squares(d, across, along, columns[i], rows[i], lens)
         number, hole = np.float32(np.int32(noise[i])), np.float32(np.int32(holes[i]))
         fails = min(middle - spread * hole, most)
         is_missing = (jump > edge) & (number < lack)
-        is_missing = is_missing | (fails * abs(fails) * squares > square)
+        is_missing = is_missing | (fails * abs(fails) * squares > d * d)
         is_missing = is_missing | (disparity[i + to_next] - d > slope)
-        is_missing = is_missing | (hidden[i + key] + dither * hole > keys[i + key])
-        # sigma_d = sigma_z d^2 / (f b), where sigma_z is quadratic in z
-        excess = max(GRAZING[0] * squares - GRAZING[1] * square, none)
-        sigma = second * square + linear * d + constant + grazing * excess
-        measured = d + sigma * number
-        measured = np.rint(measured * per_step) * step if steps else measured
-        code = level / measured + zero
-        is_seen = (code >= low) & (code <= high) & (d > none) & ~is_missing
-        whole = np.int32(min(max(np.rint(code), first), last))
-        codes[i] = np.uint16(whole) if is_seen else np.uint16(NOTHING_SEEN)
+        is_missing = is_missing | (hidden[i] + dither * hole > keys[i])
+        code = _code(d, squares, number, errors)
+        codes[i] = np.uint16(NOTHING_SEEN) if is_missing else code
+
+
+@kernel(counts=False, fastmath=FAST)
+def _squares(
+    d: np.float32,
+    across: np.float32,
+    along: np.float32,
+    column: np.float32,
+    row: np.float32,
+    lens: Lens,
+) -> np.float32:
+    """d^2 over cos^2 of the incidence, of a disparity d and its slopes.
+
+    The ray is (x, y, 1). Where d is affine in u = fx x and v = fy y, the normal over its distance,
+    times f b, is (fx d_u, fy d_v, d - u d_u - v d_v), and its product with the ray is d.
+    """
+    fx, fy, per_fx, per_fy, first_x, first_y = lens
+    x, y = per_fx * column + first_x, per_fy * row + first_y
+    normal_x, normal_y = fx * across, fy * along
+    normal_z = d - x * normal_x - y * normal_y
+    ray = x * x + y * y + np.float32(1.0)
+    return (normal_x * normal_x + normal_y * normal_y + normal_z * normal_z) * ray
+
+
+@kernel(counts=False, fastmath=FAST)
+def _code(d: np.float32, squares: np.float32, number: np.float32, errors: Errors) -> np.uint16:
+    """The code of a disparity with noise and in steps."""
+    second, linear, constant, grazing, step, per_step = errors[:6]
+    level, zero, low, high, first, last = errors[6:]
+    none, square = np.float32(0.0), d * d
+    # sigma_d = sigma_z d^2 / (f b), where sigma_z is quadratic in z
+    excess = max(GRAZING[0] * squares - GRAZING[1] * square, none)
+    measured = d + (second * square + linear * d + constant + grazing * excess) * number
+    measured = np.rint(measured * per_step) * step if step > none else measured
+    code = level / measured + zero
+    is_seen = (code >= low) & (code <= high) & (d > none)
+    whole = np.int32(min(max(np.rint(code), first), last))
+    return np.uint16(whole) if is_seen else np.uint16(NOTHING_SEEN)

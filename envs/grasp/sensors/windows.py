@@ -194,9 +194,8 @@ def _match_rows(
         desk.disparity,
         stride,
         matching.side,
-        desk.keys,
-        hidden,
-        matching.reach,
+        desk.keys[matching.reach :],
+        hidden[matching.reach :],
         desk.columns,
         desk.rows,
         noise,
@@ -208,8 +207,8 @@ def _match_rows(
     )
     _darken_boxes(matching, picture, first, holes, desk)
     sigma = strength * matching.jitter
-    step = max(math.ceil(sigma), 1)
-    limit = -quantile(MEAN_EXCESS * sigma / step, matching.window)
+    step = min(max(math.ceil(sigma), 1), margin)
+    limit = -quantile(min(MEAN_EXCESS * sigma / step, 0.5), matching.window)
     edge = max(EDGE_M * limits.codes_per_m, 1.0)
     displace(desk.codes, stride, step, limit, edge, noise, matching.window, desk.moved)
     add_specks(desk.words, strength * matching.speck + matching.missing[picture], desk.codes)

@@ -375,8 +375,10 @@ def test_scale_and_offset_are_those_of_the_view() -> None:
     np.testing.assert_allclose(beyond[1], 1979.8, atol=0.5)
 
 
-def test_an_image_depends_on_its_seed_alone() -> None:
-    views, depth = fixed_views(camera(6), 3), np.stack([clutter(k)[::6, ::6] for k in range(3)])
+def test_an_image_depends_on_its_own_seed_and_strength_alone() -> None:
+    views = fixed_views(camera(6), 3)
+    views = views.with_arrays({"sensor_strength": np.array([1.0, 10.0, 1.0])})
+    depth = np.stack([clutter(k)[::6, ::6] for k in range(3)])
     space, seeds = DepthImage(80, 107), np.array([5, 6, 5], np.uint64)
     images = sense_depth(depth.astype(np.float32), views, space, seeds)
     for k in range(3):

@@ -28,6 +28,12 @@ RESOLUTION_M = 0.005
 COUNT = 7  # not a multiple of the workers
 CAMERAS = {
     "depth": Camera(type="depth", width=48, height=40),
+    "lit": Camera(
+        type="depth",
+        width=48,
+        height=40,
+        sensor={"type": "structured_light", "strength": (0.5, 3.0)},
+    ),
     "rgb": Camera(type="rgb", width=40, height=48),
 }
 SPACE = DepthImage(40, 48)
@@ -96,7 +102,8 @@ def test_results_are_those_of_one_process(
         for simulator in (in_process, two_workers):
             simulator.load(index, scenes[index], home(len(index)))
             images = [simulator.render(index, view[index]) for view in views.values()]
-            images.append(simulator.render_depth(index, views["depth"][index], SPACE, seeds[index]))
+            for view in (views["depth"][index], views["lit"][index]):
+                images.append(simulator.render_depth(index, view, SPACE, seeds[index]))
             contacts = simulator.move(index, paths[index], RESOLUTION_M)
             images.append(simulator.render(index, views["rgb"][index]))  # the robot moved
             results.append([contacts.touched, contacts.collided, *images])
