@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -72,6 +73,22 @@ SUCCESS = rate("success", "success")
 """Figure that every environment may report, and need not declare."""
 
 
+@dataclass(frozen=True)
+class Unanswerable:
+    """Observations before which no action is right.
+
+    Attributes:
+        kind: what is the matter with them.
+        observations: arrays (n, ...) by name; those that only a critic sees are left out.
+        is_foreseen: whether policies may learn from them to be unsure. The others tell what happens
+            before what nobody thought of.
+    """
+
+    kind: str
+    observations: Mapping[str, NDArray[Any]]
+    is_foreseen: bool = True
+
+
 class PhysicalCheck(Protocol):
     """Carries out actions in a world with full physics, apart from the episodes."""
 
@@ -117,9 +134,12 @@ class Evaluator:
             the deterministic policy plays them. The `episode_metrics` must then be there after an
             episode's first action, as if it ended with it.
         check_name: what reports call the physical check.
+        answer_limits: of episode metrics that are errors, by name, none below 0: a first action is
+            right where none is over its limit. Of a metric whose limit is 0 any is too much.
     """
 
     figures: tuple[Figure, ...] = ()
+    answer_limits: Mapping[str, float] = MappingProxyType({})
     judges_first_action: bool = False
     check_name: str = "check"
 
@@ -141,6 +161,15 @@ class Evaluator:
             ValueError: there is nothing to draw, or something needed for it is not installed.
         """
         raise ValueError("the environment has no pictures to show")
+
+    def unanswerable(self, count: int, seed: int) -> Iterator[Unanswerable]:
+        """Observations of all kinds before which no action is right; the episodes do not notice.
+
+        Args:
+            count: how many of each kind.
+            seed: of what is drawn for them.
+        """
+        yield from ()
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,14 @@ from pydantic import BaseModel
 
 from encoders.spaces import DepthImage
 from envs.environment import Environment
-from envs.evaluation import Evaluator, PhysicalCheckOption, RunFileOption, error, rate
+from envs.evaluation import (
+    Evaluator,
+    PhysicalCheckOption,
+    RunFileOption,
+    Unanswerable,
+    error,
+    rate,
+)
 from rewards.reward import RewardTerm
 from trainers import run as run_module
 from trainers.algorithms.ppo import PPO
@@ -186,6 +193,13 @@ class DartsEvaluator(Evaluator):
     )
     judges_first_action = True
     check_name = "throw"
+    answer_limits: Mapping[str, float] = {"distance_m": 0.7}
+
+    def unanswerable(self, count: int, seed: int) -> Iterator[Unanswerable]:
+        rng = np.random.default_rng(seed)
+        for kind, is_foreseen in (("off the board", True), ("elsewhere", False)):
+            goal = rng.uniform(5.0, 9.0, (count, 2)) * rng.choice([-1.0, 1.0], (count, 2))
+            yield Unanswerable(kind, {"goal": goal.astype(np.float32)}, is_foreseen)
 
     def physical_check(self, *, window: bool = False) -> Throw:
         if window:

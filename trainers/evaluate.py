@@ -99,8 +99,8 @@ def _generic_options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=PROGRAM, usage=f"{PROGRAM} POLICY [KEY=VALUE ...] [options]", add_help=False
     )
-    parser.add_argument("--episodes", type=_positive, help="how many (default: the environment's)")
-    parser.add_argument("--seed", type=_seed, default=0, help="of the episodes")
+    parser.add_argument("--episodes", type=positive, help="how many (default: the environment's)")
+    parser.add_argument("--seed", type=seed_number, default=0, help="of the episodes")
     parser.add_argument(
         "--render",
         nargs="?",
@@ -201,11 +201,21 @@ def _write(path: Path, report: dict[str, Any]) -> None:
         raise UserError(f"{path}: {error.strerror}") from error
 
 
-def _positive(text: str) -> int:
+def positive(text: str) -> int:
+    """A command line's count.
+
+    Raises:
+        argparse.ArgumentTypeError: it is none.
+    """
     return _whole_number(text, 1)
 
 
-def _seed(text: str) -> int:
+def seed_number(text: str) -> int:
+    """A command line's seed of episodes.
+
+    Raises:
+        argparse.ArgumentTypeError: it is none.
+    """
     return _whole_number(text, 0)
 
 

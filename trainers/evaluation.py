@@ -252,7 +252,7 @@ def evaluate_policy(
     first_seed = FIRST_SEED + 2 * seed
     first: dict[str, Any] = {}
     if evaluator.judges_first_action or check is not None or pictures is not None:
-        metrics, outcomes = _first_actions(
+        metrics, outcomes = first_actions(
             policy, env_runner, episodes, first_seed + FIRST_ACTION, check, pictures
         )
         if evaluator.judges_first_action:
@@ -279,15 +279,23 @@ def _episode_report(evaluator: Evaluator, played: EpisodeBatch) -> dict[str, Any
     }
 
 
-def _first_actions(
+def first_actions(
     policy: ActingPolicy,
     env_runner: EnvRunner,
     episodes: int,
     seed: int,
-    check: PhysicalCheck | None,
-    pictures: EvaluationReport | None,
+    check: PhysicalCheck | None = None,
+    pictures: EvaluationReport | None = None,
 ) -> tuple[Metrics, Metrics]:
     """Takes the deterministic policy's first action in every episode.
+
+    Args:
+        policy: acts.
+        env_runner: of the environments.
+        episodes: how many.
+        seed: of the first batch; that of the next is higher by `SEEDS_PER_BATCH`.
+        check: what actions are tried out in.
+        pictures: are shown them.
 
     Returns:
         By name (episodes,): the metrics after it, and what the physical check says of it.

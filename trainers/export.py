@@ -15,6 +15,8 @@ from envs.environment import EnvironmentFailure
 from trainers.common.errors import UserError, first_lines
 from trainers.common.files import write_atomically
 from trainers.evaluation import FIRST_SEED, evaluation_environment, find_run
+from trainers.inference.confidence import FILE as CONFIDENCE
+from trainers.inference.confidence import read_confidence, to_bytes
 from trainers.inference.fitting import load_raw_policy
 from trainers.inference.metadata import FILE as METADATA
 from trainers.inference.onnx_check import (
@@ -48,8 +50,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("\n".join(export_onnx(options)))
         else:
             _refuse_camera(options)
-            export(options.policy, options.folder, options.results_dir, force=options.force)
-            print(f"{options.folder}: {', '.join((WEIGHTS, MANIFEST, CONFIGURATION, METADATA))}")
+            written = export(
+                options.policy, options.folder, options.results_dir, force=options.force
+            )
+            print(f"{options.folder}: {', '.join(written)}")
     except UserError as mistake:
         print(f"error: {mistake}", file=sys.stderr)
         return MISTAKE
@@ -78,16 +82,19 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def export(policy: str, folder: Path, results_dir: Path, *, force: bool = False) -> None:
+def export(policy: str, folder: Path, results_dir: Path, *, force: bool = False) -> list[str]:
     """Writes a policy's weights, with their checksum, its run file and its spaces.
 
-    Nothing of the training state is among them.
+    With them goes how sure it is, where that was learned; nothing of the training state does.
 
     Args:
         policy: a run's folder or id, or a checkpoint's folder.
         folder: of the exported policy; made where it is missing.
         results_dir: where a run is looked for by its id.
         force: replace a policy that is there.
+
+    Returns:
+        The files' names.
 
     Raises:
         UserError: there is no such policy, one is in the folder already, or it can't be written.
@@ -101,9 +108,14 @@ def export(policy: str, folder: Path, results_dir: Path, *, force: bool = False)
         CONFIGURATION: (source / CONFIGURATION).read_bytes(),
         METADATA: complete_metadata(source).to_json(),
     }
+    if (confidence := read_confidence(checkpoint.path)) is not None:
+        contents[CONFIDENCE] = to_bytes(confidence)
     if (folder / CHECKPOINTS).is_dir():
         raise UserError(f"{folder}: this is a run: choose another folder")
     _write(folder, contents, force)
+    if CONFIDENCE not in contents:
+        (folder / CONFIDENCE).unlink(missing_ok=True)  # of the policy that was replaced
+    return list(contents)
 
 
 def export_onnx(options: argparse.Namespace) -> list[str]:

@@ -20,12 +20,15 @@ from envs.drawing import annotated
 from envs.views import View
 from trainers.common.errors import UserError
 from trainers.common.files import write_atomically
+from trainers.inference.confidence import Card
 from trainers.inference.fitting import load_raw_policy
 from trainers.inference.onnx_policy import OnnxPolicy, is_onnx
 from trainers.inference.raw_policy import (
     ACTION,
+    EXPECTED_ERRORS,
     HIDDEN_STATE,
     NEXT_HIDDEN_STATE,
+    SURE,
     UNBOUNDED_ACTION,
     Arrays,
 )
@@ -42,6 +45,7 @@ class RawActingPolicy(Protocol):
     raw_inputs: dict[str, RawInput]
     views: dict[str, View]
     meaning: Meaning | None
+    card: Card | None
     state_size: int
 
     def run(self, raw: Mapping[str, NDArray[Any]]) -> Arrays:
@@ -56,29 +60,48 @@ class Prediction:
         file: the image's.
         outputs: (...) by name; the hidden state and the like are left out.
         meaning: of the action.
+        card: what `sure` means; None: nobody knows how sure the policy is.
     """
 
     file: Path
     outputs: Arrays
     meaning: Meaning | None
+    card: Card | None
 
     def plain(self) -> dict[str, Any]:
         """For programs: numbers in the quantities' own units, by their names."""
         plain: dict[str, Any] = {"file": str(self.file)}
-        for name, values in self.outputs.items():
-            plain[name] = values.tolist()
-            if self.meaning is not None and name == self.meaning.name:
-                names = [quantity.name for quantity in self.meaning.quantities]
-                plain[name] = dict(zip(names, values.tolist(), strict=True))
+        plain |= {name: values.tolist() for name, values in self.outputs.items()}
+        if self.meaning is not None:
+            names = [quantity.name for quantity in self.meaning.quantities]
+            plain[self.meaning.name] = _named(names, self.outputs[self.meaning.name])
+        if self.card is not None:
+            names = [error.metric for error in self.card.estimated]
+            plain[EXPECTED_ERRORS] = _named(names, self.outputs[EXPECTED_ERRORS])
         return plain
 
     def caption(self) -> str:
-        """For people: what the action means, or where nothing is known of that, the action."""
+        """For people: what the action means, if that is known, and how sure it is, if that is."""
+        return "   ".join([*self._shown_action(), *self._shown_confidence()])
+
+    def _shown_action(self) -> list[str]:
         if self.meaning is None:
-            return f"{ACTION} {np.array2string(self.outputs[ACTION], precision=3)}"
+            return [f"{ACTION} {np.array2string(self.outputs[ACTION], precision=3)}"]
         values = self.outputs[self.meaning.name].tolist()
         parts = zip(self.meaning.quantities, values, strict=True)
-        return "   ".join(quantity.shown(value) for quantity, value in parts)
+        return [quantity.shown(value) for quantity, value in parts]
+
+    def _shown_confidence(self) -> list[str]:
+        if self.card is None:
+            return []
+        expected = zip(self.card.estimated, self.outputs[EXPECTED_ERRORS].tolist(), strict=True)
+        errors = ", ".join(error.shown(value) for error, value in expected)
+        verdict = "sure" if self.outputs[SURE] else "NOT SURE"
+        return [f"{verdict} ({errors} expected)" if errors else verdict]
+
+
+def _named(names: Sequence[str], values: NDArray[Any]) -> dict[str, float]:
+    return dict(zip(names, values.tolist(), strict=True))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -137,7 +160,7 @@ def predict(options: argparse.Namespace) -> list[Prediction]:
         state = {HIDDEN_STATE: np.zeros((1, policy.state_size), np.float32)}
         outputs = policy.run({name: raw[None], **state})
         told = {key: values[0] for key, values in outputs.items() if key not in INNER_OUTPUTS}
-        predictions.append(Prediction(file, told, policy.meaning))
+        predictions.append(Prediction(file, told, policy.meaning, policy.card))
         if drawing is not None:
             _draw(drawing, predictions[-1], policy, name, raw)
     return predictions

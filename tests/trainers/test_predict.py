@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 import yaml
 
+from trainers.evaluation import evaluation_environment, find_run
+from trainers.inference.policy import Policy
 from trainers.learn import DONE, MISTAKE
 from trainers.predict import main
 
@@ -65,7 +68,34 @@ def test_folders_and_files_say_the_same(run: Run, image: Path, shipped_onnx: Pat
     code, output, _ = run(shipped_onnx, image)
     x_mm = 1000 * poses[0]["x_m"]
     assert output.startswith(f"{image}: x {x_mm:.2f} mm   y ")
-    assert output.rstrip().endswith(f"yaw {np.degrees(poses[0]['yaw_rad']):.2f} deg")
+    assert f"yaw {np.degrees(poses[0]['yaw_rad']):.2f} deg   NOT SURE (position error " in output
+
+
+def test_it_is_said_how_sure_the_answer_is(
+    run: Run, image: Path, shipped_onnx: Path, tmp_path: Path
+) -> None:
+    _, settings = find_run(str(SHIPPED), (), Path("results"))
+    with closing(evaluation_environment(settings, 8)) as env:
+        shown, _ = env.reset(seed=5)
+    for number, depth in enumerate(shown[CAMERA]):
+        assert cv2.imwrite(str(tmp_path / f"{number}.png"), depth)
+    files = [tmp_path / f"{number}.png" for number in range(8)]
+    answer = Policy.load(SHIPPED, full_precision=True).answer(shown)
+    assert answer.sure.sum() >= 6
+    for policy in (SHIPPED, shipped_onnx):
+        told = json.loads(run(policy, *files, "--json")[1])
+        assert [one["sure"] for one in told] == answer.sure.tolist()
+        assert [one["probability"] for one in told] == pytest.approx(answer.probability, abs=1e-3)
+        for name, values in answer.errors.items():
+            expected = [one["expected_errors"][name] for one in told]
+            assert expected == pytest.approx(values, rel=0.02)
+    row = int(answer.sure.argmax())
+    _, output, _ = run(shipped_onnx, files[row])
+    error_mm = 1000 * answer.errors["position_error_m"][row]
+    assert f"   sure (position error {error_mm:.1f}"[:-2] in output
+    assert output.rstrip().endswith(" deg expected)")
+    wall = json.loads(run(SHIPPED, image, "--json")[1])[0]
+    assert not wall["sure"]
 
 
 def test_units_are_told_or_known(run: Run, image: Path, tmp_path: Path) -> None:

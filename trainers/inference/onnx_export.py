@@ -19,8 +19,11 @@ from trainers.common.errors import UserError, first_lines
 from trainers.inference.onnx_policy import require_onnx
 from trainers.inference.raw_policy import (
     ACTION,
+    EXPECTED_ERRORS,
     HIDDEN_STATE,
     NEXT_HIDDEN_STATE,
+    PROBABILITY,
+    SURE,
     Arrays,
     RawPolicy,
 )
@@ -89,12 +92,16 @@ def _properties(policy: RawPolicy, card: Card) -> dict[str, str]:
         outputs[policy.meaning.name] = policy.meaning.model_dump(mode="json")
     if policy.state_size:
         outputs[NEXT_HIDDEN_STATE] = {"size": policy.state_size}
+    if policy.card is not None:
+        names = [error.metric for error in policy.card.estimated]
+        outputs |= {EXPECTED_ERRORS: names, PROBABILITY: "of being right", SURE: "bool"}
     std = policy.exploration_std
     plain = {
         "inputs": {name: raw.about() for name, raw in policy.raw_inputs.items()},
         "outputs": outputs,
         "views": {name: view.model_dump(mode="json") for name, view in policy.views.items()},
         "exploration_std": None if std is None else std.tolist(),
+        "confidence": None if policy.card is None else policy.card.model_dump(mode="json"),
     }
     return {
         "ventosa": importlib.metadata.version("ventosa"),

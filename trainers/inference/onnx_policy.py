@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from envs.deployment import Deployment, Meaning
 from envs.views import View
 from trainers.common.errors import UserError, first_lines
+from trainers.inference.confidence import Card as ConfidenceCard
 from trainers.inference.inputs import checked
 from trainers.inference.metadata import Metadata
 from trainers.inference.raw_policy import (
@@ -46,6 +47,7 @@ class OnnxPolicy:
         raw_inputs: by the name of the observation.
         views: how images are taken, by the same.
         meaning: of its actions; None: nothing but themselves.
+        card: what `sure` means; None: nobody knows how sure it is.
         configuration: the run file's text.
         state_size: m, length of the hidden state; 0 without memory.
 
@@ -142,6 +144,8 @@ class OnnxPolicy:
         self.action_space = metadata.action_space
         deployment = metadata.deployment or Deployment()
         self.meaning: Meaning | None = deployment.meaning
+        card = properties.get("confidence", "null")
+        self.card = None if card == "null" else ConfidenceCard.model_validate_json(card)
         self.views = {name: View.model_validate(view) for name, view in views.items()}
         self.raw_inputs = raw_inputs(self.observation_space, self.views)
         self.configuration = properties["configuration"]

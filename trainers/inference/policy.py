@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,11 +21,12 @@ from envs.deployment import Deployment
 from envs.environment import Environment
 from trainers.common.devices import resolve_device
 from trainers.common.errors import UserError, first_lines
+from trainers.inference.confidence import Confidence, Judgement, read_confidence
 from trainers.inference.construction import in_float32, network_factory
 from trainers.inference.inputs import checked
 from trainers.inference.metadata import Metadata, read_metadata
 from trainers.networks.actions import to_environment
-from trainers.networks.observations import to_tensors
+from trainers.networks.observations import Observations, to_tensors
 from trainers.networks.policy_network import PolicyNetwork
 from trainers.networks.recurrent import Sequences
 from trainers.runfile.registry import load_registries, plugin_manager
@@ -37,6 +38,23 @@ PLUGINS = ("encoders.plugin", "trainers.plugin")
 """Built-in plugins that a policy is made of; environments and rewards are not loaded."""
 
 
+@dataclass(frozen=True)
+class Answer:
+    """First actions (B, ...), and how sure they are; without B for observations without it.
+
+    Attributes:
+        actions: as `Policy.predict` gives them.
+        errors: (B,) expected, by the metric's name, in its own unit.
+        probability: (B,) that all errors are within their limits.
+        sure: (B,) bool; see `Policy.confidence`'s card for what that means.
+    """
+
+    actions: NDArray[Any]
+    errors: dict[str, NDArray[np.float32]]
+    probability: NDArray[np.float32]
+    sure: NDArray[np.bool_]
+
+
 class Policy:
     """A network and what goes in and comes out of it.
 
@@ -45,10 +63,12 @@ class Policy:
         observation_space: of one environment; every observation by its name.
         action_space: of one environment.
         seed: of what `predict` draws when it is not deterministic.
+        confidence: tells how sure actions are; None: nobody knows.
 
     Attributes:
         observation_space: the observations that acting needs.
         action_space: of one environment.
+        confidence: the same.
     """
 
     def __init__(
@@ -57,8 +77,10 @@ class Policy:
         observation_space: gymnasium.spaces.Dict,
         action_space: gymnasium.Space[Any],
         seed: int = 0,
+        confidence: Confidence | None = None,
     ):
         self.network, self.action_space = network, action_space
+        self.confidence = confidence
         # As pairs, whose order gymnasium keeps; it would sort a dictionary.
         self.observation_space = gymnasium.spaces.Dict(
             [(name, observation_space[name]) for name in network.sees]
@@ -95,7 +117,14 @@ class Policy:
         folder = run_folder(loaded.path)
         metadata = find_metadata(folder)
         network = _network(loaded, folder, metadata, full_precision).to(found_device).eval()
-        return cls(network, metadata.observation_space, metadata.action_space, seed)
+        confidence = read_confidence(loaded.path)
+        return cls(
+            network,
+            metadata.observation_space,
+            metadata.action_space,
+            seed,
+            None if confidence is None else confidence.to(found_device),
+        )
 
     @torch.no_grad()
     def predict(
@@ -122,17 +151,69 @@ class Policy:
             ValueError: observations of the wrong name, shape or type, or a state of the wrong
                 shape; the message names all of them, and what is expected.
         """
-        batch, is_single = checked(observations, self.observation_space, self._ignored)
-        count = len(next(iter(batch.values())))
-        tensors = to_tensors(batch, self.observation_space, self._device)
-        hidden_state = self._hidden_state(state, count)
+        tensors, is_single = self._tensors(observations, state)
         actions, after = self.network.act(
-            replace(tensors, sequences=Sequences.single(hidden_state)),
-            deterministic=deterministic,
-            generator=self._generator,
+            tensors, deterministic=deterministic, generator=self._generator
         )
         chosen, next_state = to_environment(actions, self.action_space), after.cpu().numpy()
         return (chosen[0], next_state[0]) if is_single else (chosen, next_state)
+
+    @torch.no_grad()
+    def answer(self, observations: NDArray[Any] | Mapping[str, NDArray[Any]]) -> Answer:
+        """Best actions where episodes begin, and how sure they are.
+
+        Args:
+            observations: see `predict`.
+
+        Raises:
+            UserError: nobody has learned how sure the policy is.
+            ValueError: see `predict`.
+        """
+        if self.confidence is None:
+            raise UserError(
+                "how sure this policy is has not been learned: run "
+                "`python -m trainers.calibrate POLICY`, and load it anew"
+            )
+        _, is_single = checked(observations, self.observation_space, self._ignored)
+        actions, features = self.first_actions(observations)
+        judged: Judgement = self.confidence(features)
+        row = 0 if is_single else slice(None)
+        names = [error.metric for error in self.confidence.card.estimated]
+        return Answer(
+            actions[row],
+            {k: v[row] for k, v in zip(names, judged.errors.cpu().numpy().T, strict=True)},
+            judged.probability.cpu().numpy()[row],
+            judged.sure.cpu().numpy()[row],
+        )
+
+    @torch.no_grad()
+    def first_actions(
+        self, observations: NDArray[Any] | Mapping[str, NDArray[Any]]
+    ) -> tuple[NDArray[Any], torch.Tensor]:
+        """Best actions (B, ...) where episodes begin, and the features (B, F) they are chosen by.
+
+        Args:
+            observations: see `predict`.
+
+        Raises:
+            NotImplementedError: see `PolicyNetwork.features`.
+            ValueError: see `predict`.
+        """
+        tensors, _ = self._tensors(observations, None)
+        features, _ = self.network.features(tensors)
+        actions = self.network.act_on(features, deterministic=True, generator=self._generator)
+        return to_environment(actions, self.action_space), features
+
+    def _tensors(
+        self,
+        observations: NDArray[Any] | Mapping[str, NDArray[Any]],
+        state: NDArray[np.float32] | None,
+    ) -> tuple[Observations, bool]:
+        """Observations with the hidden states before them; and whether there is but one."""
+        batch, is_single = checked(observations, self.observation_space, self._ignored)
+        tensors = to_tensors(batch, self.observation_space, self._device)
+        hidden_state = self._hidden_state(state, len(next(iter(batch.values()))))
+        return replace(tensors, sequences=Sequences.single(hidden_state)), is_single
 
     def _hidden_state(self, state: NDArray[np.float32] | None, count: int) -> torch.Tensor:
         """The state (B, m) as a tensor."""

@@ -23,6 +23,7 @@ from trainers.networks.recurrent import Sequences
 
 ACTION, UNBOUNDED_ACTION = "action", "unbounded_action"
 HIDDEN_STATE, NEXT_HIDDEN_STATE = "hidden_state", "next_hidden_state"
+EXPECTED_ERRORS, PROBABILITY, SURE = "expected_errors", "probability", "sure"
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -43,8 +44,10 @@ class RawPolicy(nn.Module):
         state_size: m, length of the hidden state; 0 without memory.
         input_names: of what `forward` takes, in this order: the observations, and `hidden_state`
             where there is memory.
-        output_names: of what it returns: `action`, the meaning's, `next_hidden_state`, and
-            `unbounded_action` where exploration adds to actions that may be out of bounds.
+        card: what `sure` means; None: nobody knows how sure it is.
+        output_names: of what it returns: `action`, the meaning's, `expected_errors`, `probability`
+            and `sure` where they are known, `next_hidden_state`, and `unbounded_action` where
+            exploration adds to actions that may be out of bounds.
         exploration_std: see `PolicyNetwork.exploration_std`.
 
     Raises:
@@ -62,7 +65,8 @@ class RawPolicy(nn.Module):
         self.network, self.views = policy.network, dict(views)
         self.observation_space, self.action_space = policy.observation_space, policy.action_space
         self.raw_inputs = raw_inputs(policy.observation_space, views)
-        self.meaning = meaning
+        self.meaning, self.confidence = meaning, policy.confidence
+        self.card = None if policy.confidence is None else policy.confidence.card
         self.state_size = self.network.state_size
         self.exploration_std = self.network.exploration_std()
         self._quantities: _Quantities | None = None
@@ -88,16 +92,23 @@ class RawPolicy(nn.Module):
         state = (
             values[-1] if self.state_size else values[0].new_zeros(count, 0, dtype=torch.float32)
         )
-        actions, after = self.network.act(
-            Observations(frames, vectors, sequences=Sequences.single(state)),
-            deterministic=True,
-            generator=torch.Generator(),
-        )
+        observations = Observations(frames, vectors, sequences=Sequences.single(state))
+        actions, after, judged = self._judged(observations)
         bounded = within(actions, self.action_space)
-        outputs = {ACTION: bounded, NEXT_HIDDEN_STATE: after, UNBOUNDED_ACTION: actions}
+        outputs = {ACTION: bounded, NEXT_HIDDEN_STATE: after, UNBOUNDED_ACTION: actions, **judged}
         if self._quantities is not None:
             outputs[self._quantities.name] = self._quantities(bounded)
         return tuple(outputs[name] for name in self.output_names)
+
+    def _judged(self, observations: Observations) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """Best actions, the hidden states after them, and how sure they are, by name."""
+        best: dict[str, Any] = {"deterministic": True, "generator": torch.Generator()}
+        if self.confidence is None:
+            return *self.network.act(observations, **best), {}
+        features, after = self.network.features(observations)
+        judged = self.confidence(features)
+        names = (EXPECTED_ERRORS, PROBABILITY, SURE)
+        return self.network.act_on(features, **best), after, dict(zip(names, judged, strict=True))
 
     @torch.no_grad()
     def run(self, raw: Mapping[str, NDArray[Any]]) -> Arrays:
@@ -108,6 +119,7 @@ class RawPolicy(nn.Module):
     def _output_names(self) -> tuple[str, ...]:
         names = [ACTION]
         names += [] if self.meaning is None else [self.meaning.name]
+        names += [] if self.card is None else [EXPECTED_ERRORS, PROBABILITY, SURE]
         names += [NEXT_HIDDEN_STATE] if self.state_size else []
         bounded = self.exploration_std is None or isinstance(self.network, OffPolicyNetwork)
         return (*names, *([] if bounded else [UNBOUNDED_ACTION]))

@@ -157,17 +157,20 @@ class ActorCritic(PolicyNetwork):
             return self._value(self.actor(seen_by_actor, known.actor))
         return self._value(self.critic(seen_by_critic, known.critic))
 
-    def act(
-        self, observations: Observations, *, deterministic: bool, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """See `PolicyNetwork.act`."""
+    def features(self, observations: Observations) -> tuple[Tensor, Tensor]:
+        """See `PolicyNetwork.features`: the actor's hidden vectors."""
         hidden, hidden_state = self.actor.forward_recurrent(self._split(observations)[0])
-        distribution = self._distribution(hidden)
-        actions = distribution.mode() if deterministic else distribution.sample(generator)
         # A critic's hidden state is of no use here, and stays as it was at the beginning.
         size = self.state_size - self.actor.state_size
         unused = hidden_state.new_zeros(len(hidden_state), size)
-        return actions, torch.cat([hidden_state, unused], dim=1)
+        return hidden, torch.cat([hidden_state, unused], dim=1)
+
+    def act_on(
+        self, features: Tensor, *, deterministic: bool, generator: torch.Generator
+    ) -> Tensor:
+        """See `PolicyNetwork.act_on`."""
+        distribution = self._distribution(features)
+        return distribution.mode() if deterministic else distribution.sample(generator)
 
     def exploration_std(self) -> Tensor | None:
         """See `PolicyNetwork.exploration_std`."""

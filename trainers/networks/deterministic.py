@@ -75,9 +75,15 @@ class DeterministicActorCritic(nn.Module):
 
     def act(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
         """mu(s): actions (B, A) in [-1, 1]; `encode_frames` may have looked at the frames."""
-        features = self._acting_encoder(observations, frame_features)
-        if self.actor_encoder is None:
-            features = features.detach()
+        return self.act_on(self.features(observations, frame_features))
+
+    def features(self, observations: Observations, frame_features: Tensor | None = None) -> Tensor:
+        """What the actor sees of the observations, (B, F)."""
+        features: Tensor = self._acting_encoder(observations, frame_features)
+        return features.detach() if self.actor_encoder is None else features
+
+    def act_on(self, features: Tensor) -> Tensor:
+        """Actions (B, A) in [-1, 1] for features (B, F)."""
         actions: Tensor = self.actor(features).tanh()
         return actions
 
@@ -135,19 +141,24 @@ class DeterministicPolicy(OffPolicyNetwork):
         self._final_sigma = final_sigma
         self._average = TargetAverage(self.target, self.online, tau)
 
-    def act(
-        self, observations: Observations, *, deterministic: bool, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """See `PolicyNetwork.act`; what is drawn has the noise of the run's end.
+    def features(self, observations: Observations) -> tuple[Tensor, Tensor]:
+        """See `PolicyNetwork.features`."""
+        features = self.online.features(observations)
+        return features, self.initial_state(len(features))
+
+    def act_on(
+        self, features: Tensor, *, deterministic: bool, generator: torch.Generator
+    ) -> Tensor:
+        """See `PolicyNetwork.act_on`; what is drawn has the noise of the run's end.
 
         No action is replaced by one of `random_actions`: those are drawn for the buffer's sake and
         say nothing of the policy.
         """
-        actions = self.online.act(observations)
+        actions = self.online.act_on(features)
         if not deterministic:
             noise = torch.randn(actions.shape, generator=generator, device=actions.device)
             actions = (actions + self._final_sigma * noise).clamp(-1.0, 1.0)
-        return self.scale(actions), self.initial_state(len(actions))
+        return self.scale(actions)
 
     def exploration_std(self) -> Tensor:
         """See `PolicyNetwork.exploration_std`."""

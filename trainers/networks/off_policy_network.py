@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
@@ -12,7 +12,7 @@ from trainers.networks.frame_features import FrameFeatures
 from trainers.networks.policy_network import PolicyNetwork
 
 
-class OffPolicyNetwork(PolicyNetwork):
+class OffPolicyNetwork(PolicyNetwork, ABC):
     """An actor of bounded actions, and critics of them, with targets.
 
     Attributes:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-
 import torch
 from torch import Tensor, nn
 
 from trainers.networks.observations import Observations
 
 
-class PolicyNetwork(nn.Module, ABC):
+class PolicyNetwork(nn.Module):
     """A policy, with whatever else is trained and saved beside it, such as critics.
 
     Attributes:
@@ -25,11 +23,13 @@ class PolicyNetwork(nn.Module, ABC):
         """Hidden states where episodes begin, (count, m)."""
         return next(self.parameters()).new_zeros(count, self.state_size)
 
-    @abstractmethod
     def act(
         self, observations: Observations, *, deterministic: bool, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
         """Actions for B observations, with the hidden states before them in their `sequences`.
+
+        A network has either `features` and `act_on`, of which this is made, or an `act` of its own;
+        then nobody can learn from its features how sure its actions are.
 
         Args:
             observations: B of them.
@@ -40,6 +40,29 @@ class PolicyNetwork(nn.Module, ABC):
             Actions (B, ...) in the units of the environment's space, and the hidden states (B, m)
             after them.
         """
+        features, hidden_state = self.features(observations)
+        return self.act_on(features, deterministic=deterministic, generator=generator), hidden_state
+
+    def features(self, observations: Observations) -> tuple[Tensor, Tensor]:
+        """What actions are chosen by, and the hidden states; see `act`.
+
+        Returns:
+            Features (B, F), and the hidden states (B, m) after the observations.
+
+        Raises:
+            NotImplementedError: the network has an `act` of its own.
+        """
+        raise NotImplementedError
+
+    def act_on(
+        self, features: Tensor, *, deterministic: bool, generator: torch.Generator
+    ) -> Tensor:
+        """Actions (B, ...) for features (B, F); see `act`.
+
+        Raises:
+            NotImplementedError: the network has an `act` of its own.
+        """
+        raise NotImplementedError
 
     def exploration_std(self) -> Tensor | None:
         """Standard deviations (A,) of what is added to the best actions where actions are drawn.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from numpy.typing import NDArray
@@ -12,12 +13,14 @@ from envs.evaluation import (
     Evaluator,
     PhysicalCheckOption,
     RunFileOption,
+    Unanswerable,
     error,
     rate,
 )
 from envs.grasp.evaluation.pick import PickCheck, Picker
 from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.evaluation.report import GraspReport
+from envs.grasp.evaluation.unanswerable import unanswerable
 from envs.grasp.robot.arm import Arm
 from envs.grasp.settings import GraspSettings
 
@@ -48,6 +51,9 @@ class GraspEvaluator(Evaluator):
         error("yaw_error_deg", "yaw error", "deg"),
     )
     judges_first_action = True
+    answer_limits: Mapping[str, float] = MappingProxyType(
+        {"position_error_m": 0.010, "yaw_error_deg": 2.0, "collision": 0.0}
+    )
     check_name = "pick"
 
     def __init__(
@@ -67,3 +73,7 @@ class GraspEvaluator(Evaluator):
     def pictures(self) -> GraspReport:
         """Scenes, errors and a film; see `envs.grasp.evaluation.report`."""
         return GraspReport(self._settings, self._arm, self._pose_commands)
+
+    def unanswerable(self, count: int, seed: int) -> Iterator[Unanswerable]:
+        """See `envs.grasp.evaluation.unanswerable`."""
+        return unanswerable(self._settings, self._arm.robot, count, seed)
