@@ -11,7 +11,7 @@ import pytest
 
 REPOSITORY = Path(__file__).parents[2]
 PAGE = (REPOSITORY / "docs/python.md").read_text()
-FIRST, LOOP = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+FIRST, LOOP, SURE = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
 def test_the_three_lines_answer_with_an_action(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -40,3 +40,17 @@ def test_the_loop_forgets_where_an_episode_ends() -> None:
     }
     exec(LOOP, known)
     assert known["state"].ravel().tolist() == [0.0, 2.0]
+
+
+def test_the_robot_moves_where_the_answer_is_sure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(REPOSITORY)
+    moves: list[Any] = []
+
+    class Robot:
+        move_to = staticmethod(moves.append)
+
+    known: dict[str, Any] = {"image": np.zeros((80, 80, 1), np.uint16), "robot": Robot()}
+    exec(FIRST, known)
+    exec(SURE, known)
+    assert not known["answer"].sure  # of a black image
+    assert moves == []
