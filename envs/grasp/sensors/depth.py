@@ -32,33 +32,25 @@ MOST = {
 
 
 class Sensor(NamedTuple):
-    """The depth sensor of n pictures, with what `DepthImage.encode` does in numbers.
+    """The depth sensor of n pictures.
 
     Attributes:
         seeds: (n,) uint64 of all that is random in each picture.
         sigma_m: (n,) of the noise.
         missing: (n,) probability of each pixel to be missing.
-        min_m, max_m: ends of the range.
-        zero_m, codes_per_m: code = (depth - zero_m) * codes_per_m.
-        first, last: codes of the ends.
+        limits: range and encoding.
         matching: of a structured-light camera, or none.
     """
 
     seeds: NDArray[np.uint64]
     sigma_m: Floats
     missing: Floats
-    min_m: float
-    max_m: float
-    zero_m: float
-    codes_per_m: float
-    first: int
-    last: int
+    limits: Limits
     matching: Matching
 
 
-NO_SENSOR = Sensor(
-    np.empty(0, np.uint64), np.empty(0), np.empty(0), 0.0, 0.0, 0.0, 0.0, 0, 0, NO_MATCHING
-)
+NO_LIMITS = Limits(0.0, 0.0, 0.0, 0.0, 0, 0)
+NO_SENSOR = Sensor(np.empty(0, np.uint64), np.empty(0), np.empty(0), NO_LIMITS, NO_MATCHING)
 
 
 class Workbench(NamedTuple):
@@ -96,10 +88,7 @@ def sensor_of(views: CameraPoses, space: DepthImage, seeds: NDArray[np.uint64]) 
         np.ascontiguousarray(seeds, np.uint64),
         np.ascontiguousarray(views.noise_sigma_m, np.float64),
         np.ascontiguousarray(views.missing_fraction, np.float64),
-        *space.range_m,
-        space.zero_m,
-        space.codes_per_m,
-        *space.codes,
+        Limits(*space.range_m, space.zero_m, space.codes_per_m, *space.codes),
         matching_of(views),
     )
 
@@ -157,15 +146,7 @@ def sense(
         for pixel in range(len(codes)):
             bench.normals[pixel] = np.float32(1.0) / true[pixel]
         true = bench.normals
-    limits = Limits(
-        sensor.min_m,
-        sensor.max_m,
-        sensor.zero_m,
-        sensor.codes_per_m,
-        sensor.first,
-        sensor.last,
-    )
-    match(true, sensor.matching, row, sensor.seeds[row], limits, bench.desk, codes)
+    match(true, sensor.matching, row, sensor.seeds[row], sensor.limits, bench.desk, codes)
 
 
 @kernel(fastmath=FAST)
@@ -182,10 +163,10 @@ def _sense_gaussian(
     if sensor.sigma_m[row] > 0.0:
         fill_normals(sensor.seeds[row], normals)
     # Where it is 0, it multiplies what an earlier picture left in the scratch.
-    sigma = np.float32(sensor.sigma_m[row])
-    low, high = np.float32(sensor.min_m), np.float32(sensor.max_m)
-    zero, scale = np.float32(sensor.zero_m), np.float32(sensor.codes_per_m)
-    first, last = np.float32(sensor.first), np.float32(sensor.last)
+    sigma, limits = np.float32(sensor.sigma_m[row]), sensor.limits
+    low, high = np.float32(limits.min_m), np.float32(limits.max_m)
+    zero, scale = np.float32(limits.zero_m), np.float32(limits.codes_per_m)
+    first, last = np.float32(limits.first), np.float32(limits.last)
     for pixel in range(len(codes)):
         depth = np.float32(1.0) / true[pixel] if inverse else true[pixel]
         measured = depth + sigma * normals[pixel]

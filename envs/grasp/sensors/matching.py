@@ -79,7 +79,13 @@ class Matching(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Range and encoding of depths; see `envs.grasp.sensors.depth.Sensor`."""
+    """What `DepthImage.encode` does, in numbers.
+
+    Attributes:
+        min_m, max_m: ends of the range.
+        zero_m, codes_per_m: code = (depth - zero_m) * codes_per_m.
+        first, last: codes of the ends.
+    """
 
     min_m: float
     max_m: float
