@@ -80,7 +80,7 @@ def desk(matching: Matching) -> Desk:
     for pixel in range(size):
         columns[pixel], rows[pixel] = pixel % stride - matching.margin, pixel // stride
     keys = np.empty(size + 2 * matching.reach, np.float32)
-    white = size + _more_noise(matching) + (matching.window - 1) * (1 + stride)
+    white = _white_size(matching, size)
     bits = np.empty((white + TOGETHER - 1) // TOGETHER * 2, np.uint32)
     return Desk(
         columns,
@@ -111,11 +111,18 @@ def _more_noise(matching: Matching) -> int:
 
 
 @kernel()
+def _white_size(matching: Matching, size: int) -> int:
+    """How many white numbers it takes to make the noise's field of them."""
+    stride = matching.width + 2 * matching.margin
+    return size + _more_noise(matching) + (matching.window - 1) * (1 + stride)
+
+
+@kernel()
 def _first_rows(desk: Desk, matching: Matching, rows: int) -> Desk:
     """The room of so many rows."""
     stride = matching.width + 2 * matching.margin
     size = rows * stride
-    white = size + _more_noise(matching) + (matching.window - 1) * (1 + stride)
+    white = _white_size(matching, size)
     return Desk(
         desk.columns[:size],
         desk.rows[:size],
