@@ -174,8 +174,8 @@ class Policy:
                 "how sure this policy is has not been learned: run "
                 "`python -m trainers.calibrate POLICY`, and load it anew"
             )
-        _, is_single = checked(observations, self.observation_space, self._ignored)
-        actions, features = self.first_actions(observations)
+        tensors, is_single = self._tensors(observations, None)
+        actions, features = self._best(tensors)
         judged: Judgement = self.confidence(features)
         row = 0 if is_single else slice(None)
         names = [error.metric for error in self.confidence.card.estimated]
@@ -199,7 +199,10 @@ class Policy:
             NotImplementedError: see `PolicyNetwork.features`.
             ValueError: see `predict`.
         """
-        tensors, _ = self._tensors(observations, None)
+        return self._best(self._tensors(observations, None)[0])
+
+    def _best(self, tensors: Observations) -> tuple[NDArray[Any], torch.Tensor]:
+        """Best actions (B, ...), and the features (B, F) they are chosen by."""
         features, _ = self.network.features(tensors)
         actions = self.network.act_on(features, deterministic=True, generator=self._generator)
         return to_environment(actions, self.action_space), features
