@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -16,7 +15,7 @@ from trainers.common.errors import UserError, first_lines
 from trainers.common.files import write_atomically
 from trainers.evaluation import FIRST_SEED, evaluation_environment, find_run
 from trainers.inference.confidence import FILE as CONFIDENCE
-from trainers.inference.confidence import read_confidence, to_bytes
+from trainers.inference.confidence import read_confidence, to_bytes, weights_digest
 from trainers.inference.fitting import load_raw_policy
 from trainers.inference.metadata import FILE as METADATA
 from trainers.inference.onnx_check import (
@@ -175,7 +174,7 @@ def _card(checkpoint: Loaded) -> Card:
     return Card(
         metadata=complete_metadata(source).to_json(),
         configuration=(source / CONFIGURATION).read_text(),
-        weights_sha256=hashlib.sha256((checkpoint.path / WEIGHTS).read_bytes()).hexdigest(),
+        weights_sha256=weights_digest(checkpoint.path),
     )
 
 
