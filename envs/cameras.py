@@ -70,6 +70,16 @@ def look_at(position_m: Floats, target_m: Floats, roll_rad: float = 0.0) -> Floa
     return upright @ euler_rotations(np.array([[0.0, 0.0, roll_rad]]))[0]
 
 
+def yaw_rotations(yaw_rad: Floats) -> Floats:
+    """Rotations (..., 3, 3) by angles (...) about the vertical."""
+    cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
+    rotations = np.zeros((*np.shape(yaw_rad), 3, 3))
+    rotations[..., 0, 0], rotations[..., 0, 1] = cosine, -sine
+    rotations[..., 1, 0], rotations[..., 1, 1] = sine, cosine
+    rotations[..., 2, 2] = 1.0
+    return rotations
+
+
 def euler_rotations(angles_rad: Floats) -> Floats:
     """Rotations (n, 3, 3) by angles (n, 3) about x, then y, then z."""
     sine, cosine = np.sin(angles_rad), np.cos(angles_rad)

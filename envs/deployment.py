@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, FiniteFloat
 
-from envs.cameras import Floats, Point
+from envs.cameras import Floats, Point, yaw_rotations
 
 Polyline = tuple[Point, ...]
 
@@ -61,8 +61,7 @@ class Meaning(BaseModel, frozen=True, extra="forbid"):
     def lines(self, values: NDArray[np.floating]) -> list[Floats]:
         """The outline (k, 3) at a place (4,), in the frame of the mounts."""
         x, y, z, heading = values.astype(np.float64)
-        cosine, sine = np.cos(heading), np.sin(heading)
-        turned = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        turned = yaw_rotations(heading)
         return [np.array(line) @ turned.T + (x, y, z) for line in self.outline]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.cameras import yaw_rotations
 from envs.grasp.sensors.structured_light import StructuredLight
 from envs.grasp.settings import GraspSettings
 
@@ -45,9 +46,9 @@ def draw_dark(
     places = [rng.uniform(*ends, (n, patches, 1)) for ends in (x, y, z)]
     boxes = np.concatenate(
         [
-            _boxes(_rotations(yaw_rad), center, half + MARGIN_M, position_m),
+            _boxes(yaw_rotations(yaw_rad), center, half + MARGIN_M, position_m),
             _boxes(
-                _rotations(rng.uniform(0.0, np.pi, (n, patches))),
+                yaw_rotations(rng.uniform(0.0, np.pi, (n, patches))),
                 np.zeros((n, patches, 3)),
                 rng.uniform(*PATCH_HALF_M, (n, patches, 3)),
                 np.concatenate(places, axis=2),
@@ -70,14 +71,6 @@ def _hulls(center_m: Floats, half_m: Floats) -> tuple[Floats, Floats]:
     low = np.where(half_m > 0.0, center_m - half_m, np.inf).min(axis=2)
     high = np.where(half_m > 0.0, center_m + half_m, -np.inf).max(axis=2)
     return (low + high) / 2, (high - low) / 2
-
-
-def _rotations(yaw_rad: Floats) -> Floats:
-    """(..., 3, 3) about the vertical."""
-    cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
-    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
-    rows = [[cosine, -sine, zero], [sine, cosine, zero], [zero, zero, one]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _boxes(rotation: Floats, center_m: Floats, half_m: Floats, origin_m: Floats) -> Floats:

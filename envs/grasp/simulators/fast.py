@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
+from envs.cameras import yaw_rotations
 from envs.grasp.robot.kinematics import shape_reach
 from envs.grasp.robot.paths import Path, check_knots
 from envs.grasp.robot.urdf import Box, Robot
@@ -264,10 +265,7 @@ def _boxes(scenes: Scenes) -> tuple[Floats, Floats, Floats]:
     First come the blocks', then what stands around.
     """
     n, blocks, boxes = scenes.box_half_m.shape[:3]
-    cosine, sine = np.cos(scenes.block_yaw_rad), np.sin(scenes.block_yaw_rad)
-    turn = np.zeros((n, blocks, 3, 3))
-    turn[..., 0, 0], turn[..., 0, 1], turn[..., 1, 0], turn[..., 1, 1] = cosine, -sine, sine, cosine
-    turn[..., 2, 2] = 1.0
+    turn = yaw_rotations(scenes.block_yaw_rad)
     center = scenes.block_position_m[:, :, None] + np.matmul(
         scenes.box_center_m, np.swapaxes(turn, -1, -2)
     )
