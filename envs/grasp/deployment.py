@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from encoders.spaces import MM_PER_M
 from envs.cameras import Point, look_at
 from envs.deployment import Deployment, Meaning, Mount, Quantity
 from envs.grasp.robot.urdf import load_robot
@@ -11,7 +12,6 @@ from envs.grasp.settings import Camera, GraspSettings, Workspace
 
 RIM_POINTS = 32
 STEM_M = 0.08
-MM_PER_M = 1000.0
 
 
 def deployment(settings: GraspSettings) -> Deployment:
