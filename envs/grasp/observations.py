@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -11,8 +12,9 @@ from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage, RgbImage
 from envs.grasp.episode_state import RunningEpisodes
-from envs.grasp.sensors.camera import pinhole, sampling
+from envs.grasp.sensors.camera import CameraPoses, pinhole, sampling
 from envs.grasp.settings import GraspSettings
+from envs.grasp.simulators.base import Simulator
 
 PRIVILEGED = "privileged"
 POSES_AND_PROGRESS, LIMITS = 18, 4
@@ -37,6 +39,38 @@ def observation_space(settings: GraspSettings) -> gymnasium.spaces.Dict:
         size = POSES_AND_PROGRESS + (LIMITS if settings.privileged_limits else 0)
         spaces[PRIVILEGED] = Box(-np.inf, np.inf, (size,), np.float32)
     return gymnasium.spaces.Dict(spaces)
+
+
+def take_images(
+    simulator: Simulator,
+    indices: NDArray[np.int64],
+    views: Mapping[str, CameraPoses],
+    spaces: Mapping[str, gymnasium.Space[Any]],
+    rng: np.random.Generator,
+) -> dict[str, NDArray[Any]]:
+    """Images (n, H, W, C) as cameras deliver them now, by their names.
+
+    Args:
+        simulator: holds the worlds.
+        indices: of the n worlds.
+        views: the cameras.
+        spaces: of their images; a mapping or a space of spaces.
+        rng: the source of the sensors' randomness.
+    """
+    images: dict[str, NDArray[Any]] = {}
+    for name, view in views.items():
+        space = spaces[name]
+        if isinstance(space, DepthImage):
+            seeds = picture_seeds(rng, len(indices))
+            images[name] = simulator.render_depth(indices, view, space, seeds)
+        else:
+            images[name] = simulator.render(indices, view)
+    return images
+
+
+def picture_seeds(rng: np.random.Generator, count: int) -> NDArray[np.uint64]:
+    """Seeds (count,) of all that is random in as many pictures."""
+    return rng.integers(2**63, size=count, dtype=np.uint64)
 
 
 def privileged_state(episodes: RunningEpisodes, settings: GraspSettings) -> NDArray[np.float32]:

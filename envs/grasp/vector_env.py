@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from curricula.samplers import ParameterValue, draw
-from encoders.spaces import DepthImage
 from envs.deployment import Deployment
 from envs.environment import Environment, ObservationArrays, StepResult
 from envs.evaluation import EvaluationOption
@@ -23,7 +22,12 @@ from envs.grasp.deployment import deployment
 from envs.grasp.episode_state import RunningEpisodes
 from envs.grasp.evaluation.evaluator import EVALUATION_OPTIONS, GraspEvaluator
 from envs.grasp.evaluation.pose_commands import PoseCommands
-from envs.grasp.observations import PRIVILEGED, observation_space, privileged_state
+from envs.grasp.observations import (
+    PRIVILEGED,
+    observation_space,
+    privileged_state,
+    take_images,
+)
 from envs.grasp.parameters import (
     GOAL_PARAMETERS,
     SENSOR_PARAMETERS,
@@ -277,15 +281,8 @@ class GraspVectorEnv(Environment):
         self, indices: NDArray[np.int64], views: Mapping[str, CameraPoses]
     ) -> dict[str, NDArray[Any]]:
         """Images (n, H, W, C) of each camera now in some worlds, by its name."""
-        pictures: dict[str, NDArray[Any]] = {}
-        for name, view in views.items():
-            space = self.single_observation_space[name]
-            if isinstance(space, DepthImage):
-                seeds = self._rng.integers(2**63, size=len(indices), dtype=np.uint64)
-                pictures[name] = self._simulator.render_depth(indices, view, space, seeds)
-            else:
-                pictures[name] = self._simulator.render(indices, view)
-        return pictures
+        spaces = self.single_observation_space
+        return take_images(self._simulator, indices, views, spaces, self._rng)
 
     def _observations(self) -> ObservationArrays:
         episodes = self._running()

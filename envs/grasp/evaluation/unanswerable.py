@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 from encoders.cameras import Pinhole
 from encoders.spaces import DepthImage
 from envs.evaluation import Unanswerable
-from envs.grasp.observations import PRIVILEGED, observation_space
+from envs.grasp.observations import (
+    PRIVILEGED,
+    observation_space,
+    picture_seeds,
+    take_images,
+)
 from envs.grasp.parameters import YAW_LIMIT, parameter_ranges
 from envs.grasp.robot.arm import Arm
 from envs.grasp.robot.urdf import Robot
@@ -94,12 +99,7 @@ def _taken(
     """Images of scenes, with the robot at home."""
     indices = np.arange(len(scenes))
     simulator.load(indices, scenes, arm.home(len(scenes)).joints_rad)
-    return {
-        name: simulator.render_depth(indices, view, spaces[name], _seeds(rng, len(scenes)))
-        if isinstance(spaces[name], DepthImage)
-        else simulator.render(indices, view)
-        for name, view in views.items()
-    }
+    return take_images(simulator, indices, views, spaces, rng)
 
 
 def _drawn(
@@ -116,15 +116,11 @@ def _drawn(
             height, width, _ = space.shape
             rays = np.stack([Pinhole(*i).rays(height, width) for i in view.intrinsics])
             depth_m = draw(rng, rays.astype(np.float32), space.range_m).astype(np.float32)
-            images[name] = sense_depth(depth_m, view, space, _seeds(rng, count))
+            images[name] = sense_depth(depth_m, view, space, picture_seeds(rng, count))
         else:
             colors = rng.integers(256, size=(count, 1, 1, 3), dtype=np.uint8)
             images[name] = np.broadcast_to(colors, (count, *space.shape)).copy()
     return images
-
-
-def _seeds(rng: np.random.Generator, count: int) -> NDArray[np.uint64]:
-    return rng.integers(2**63, size=count, dtype=np.uint64)
 
 
 def _plane(rng: np.random.Generator, rays: Floats, range_m: tuple[float, float]) -> Floats:
