@@ -32,6 +32,7 @@ from envs.evaluation import (
     rate,
 )
 from rewards.reward import RewardTerm
+from trainers import evaluation
 from trainers import run as run_module
 from trainers.algorithms.ppo import PPO
 from trainers.algorithms.trpo import TRPO
@@ -567,3 +568,22 @@ def one_thread() -> Any:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def learned(
+    learn: Callable[..., Any],
+    write_run: Callable[..., Path],
+    registries: Registries,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Callable[..., Path]:
+    """Learns a run `toy` that can be evaluated: `learned("target", trainer)`; the results."""
+    monkeypatch.setattr(evaluation, "load_registries", lambda: registries)
+
+    def results(environment: str, trainer: Any = None) -> Path:
+        done = learn(write_run(environment, trainer))
+        assert done.code == DONE, done.errors
+        found: Path = done.results
+        return found
+
+    return results

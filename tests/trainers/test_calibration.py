@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from envs.evaluation import Evaluator
-from trainers import calibration, evaluation
+from trainers import calibration
 from trainers.calibrate import main
 from trainers.calibration import FIRST_SEED, RecordedPolicy
 from trainers.common.errors import UserError
@@ -32,23 +32,14 @@ EPISODES = "2000"
 
 
 @pytest.fixture
-def learned(
-    learn: Callable[..., Any],
-    write_run: Callable[..., Path],
-    registries: Registries,
-    monkeypatch: pytest.MonkeyPatch,
-) -> Callable[..., Path]:
-    """Learns a run `toy`; returns the results."""
-    monkeypatch.setattr(evaluation, "load_registries", lambda: registries)
-    monkeypatch.setattr(calibration, "TARGET", 0.9)  # can be shown in hundreds of episodes
+def learned(learned: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """The same, with a target that can be shown in hundreds of episodes."""
+    monkeypatch.setattr(calibration, "TARGET", 0.9)
 
-    def run(environment: str = "darts", trainer: Any = None) -> Path:
-        done = learn(write_run(environment, trainer))
-        assert done.code == DONE, done.errors
-        found: Path = done.results
-        return found
+    def results(environment: str = "darts", trainer: Any = None) -> Path:
+        return learned(environment, trainer)
 
-    return run
+    return results
 
 
 def calibrate(results: Path, *options: str, name: str = "toy") -> int:

@@ -13,22 +13,12 @@ from trainers import evaluation
 from trainers.evaluation import evaluate
 from trainers.export import main
 from trainers.learn import DONE, MISTAKE
-from trainers.runfile.registry import Registries
 
 
 @pytest.fixture
-def results(
-    learn: Callable[..., Any],
-    write_run: Callable[..., Path],
-    registries: Registries,
-    monkeypatch: pytest.MonkeyPatch,
-) -> Path:
+def results(learned: Callable[..., Path]) -> Path:
     """The results of a run `toy`."""
-    monkeypatch.setattr(evaluation, "load_registries", lambda: registries)
-    learned = learn(write_run("target"))
-    assert learned.code == DONE, learned.errors
-    found: Path = learned.results
-    return found
+    return learned("target")
 
 
 def export(results: Path, folder: Path, *options: str) -> int:
@@ -49,18 +39,9 @@ def test_an_exported_policy_has_the_figures_of_its_run(results: Path, tmp_path: 
 
 
 @pytest.fixture
-def darts(
-    learn: Callable[..., Any],
-    write_run: Callable[..., Path],
-    registries: Registries,
-    monkeypatch: pytest.MonkeyPatch,
-) -> Path:
+def darts(learned: Callable[..., Path]) -> Path:
     """The results of a run `toy` whose first actions are judged, and whose others are drawn."""
-    monkeypatch.setattr(evaluation, "load_registries", lambda: registries)
-    learned = learn(write_run("darts"))
-    assert learned.code == DONE, learned.errors
-    found: Path = learned.results
-    return found
+    return learned("darts")
 
 
 def test_an_onnx_file_has_the_figures_of_its_run(
