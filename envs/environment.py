@@ -77,6 +77,16 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
         """What policies are used by away from the environment; nothing need be declared."""
         return Deployment()
 
+    @classmethod
+    def harder(cls, settings: BaseModel) -> Mapping[str, BaseModel]:
+        """Settings of tasks that policies are not trained for, by what is harder in them.
+
+        They have the same observations and actions; `trainers.calibrate` learns from them when
+        policies should be unsure. One that can't be had, with a ValueError when it is reset, is
+        left out there. Nothing need be declared.
+        """
+        return {}
+
     def set_parameters(self, parameters: Mapping[str, ParameterValue]) -> None:
         """Sets environment parameters; they hold from each environment's next reset on."""
         if unknown := sorted(set(parameters) - self.parameter_names):

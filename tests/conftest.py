@@ -177,6 +177,16 @@ class DartsEnvironment(TargetEnvironment):
         PhysicalCheckOption("--watch", "throw them before your eyes", window=True),
     )
 
+    @classmethod
+    def harder(cls, settings: Any) -> dict[str, Any]:
+        none = settings.model_copy(update={"episode_steps": 0})
+        return {"one throw": settings.model_copy(update={"episode_steps": 1}), "no throw": none}
+
+    def reset(self, **options: Any) -> tuple[Any, ...]:
+        if self._settings.episode_steps == 0:
+            raise ValueError("nobody may throw")
+        return super().reset(**options)
+
     def step(self, actions: np.ndarray) -> tuple[Any, ...]:
         *results, infos = super().step(actions)
         metrics = infos["episode_metrics"]

@@ -71,15 +71,19 @@ def told(card: Card) -> Iterator[str]:
     else:
         yield f"sure is a probability of that of {card.threshold:.4f} or more"
     if card.measured is not None:
-        yield from _measured(card.measured, card.target)
+        yield f"wanted: {card.target:.1%} of the sure are right; measured in other episodes:"
+        yield from _measured(card.measured)
 
 
-def _measured(measured: Measured, target: float) -> Iterator[str]:
-    yield f"of {measured.episodes} unseen first actions {measured.right:.2%} are right"
-    right = "none" if measured.sure_right is None else f"{measured.sure_right:.2%}"
-    yield f"sure: {measured.coverage:.2%}, of which {right} are right (wanted: {target:.1%})"
-    for kind, (count, sure) in measured.unanswerable.items():
-        yield f"sure before {kind}: {sure} of {count}"
+def _measured(measured: Measured) -> Iterator[str]:
+    for name, counts in {"as trained": measured.ordinary, **measured.harder}.items():
+        right = f", of which {counts.sure_right / counts.sure:.2%} right" if counts.sure else ""
+        yield (
+            f"  {name}: {counts.right / counts.actions:.2%} of {counts.actions} right; "
+            f"sure {counts.sure / counts.actions:.2%}{right}"
+        )
+    for kind, counts in measured.unanswerable.items():
+        yield f"  {kind}: sure {counts.sure} of {counts.actions}"
 
 
 if __name__ == "__main__":

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Iterator, Mapping
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from trainers.inference.confidence import (
     FILE,
     Card,
     Confidence,
+    Counts,
     Measured,
     judged_errors,
     to_bytes,
@@ -35,13 +38,17 @@ from trainers.inference.confidence_fit import (
     Examples,
     choose_threshold,
     fit,
+    joined,
     ordinary_distance,
     rescale,
 )
 from trainers.inference.onnx_policy import is_onnx
 from trainers.inference.policy import Policy
 from trainers.reporting.figures import Metrics
+from trainers.runfile.settings import RunSettings
 from trainers.saving.run_folder import find_checkpoint
+
+_logger = logging.getLogger("ventosa")
 
 TARGET = 0.995
 """Share of what is called sure that is to be right."""
@@ -54,6 +61,8 @@ SHARES = (0.55, 0.30)
 """Of the episodes: to fit in, and to choose the threshold in; the rest is to measure in."""
 EPISODES_PER_UNANSWERABLE = 40
 """There is one observation of each kind that can't be answered for so many episodes."""
+EPISODES_PER_HARDER = 20
+"""There is one episode of each harder task for so many of the ordinary."""
 
 
 class RecordedPolicy:
@@ -112,17 +121,21 @@ def calibrate(
     _, run = find_run(name, (), results_dir)
     with closing(evaluation_environment(run, episodes)) as env:
         features, metrics = _answered(policy, env, episodes, FIRST_SEED + seed)
-        unanswerable = _unanswered(policy, env, episodes // EPISODES_PER_UNANSWERABLE, seed)
-        limits = dict(env.evaluator().answer_limits)
+        evaluator = env.evaluator()
         card = Card(
             weights_sha256=weights_digest(folder),
             features=features.shape[1],
-            errors=judged_errors(env.evaluator().figures, limits),
+            errors=judged_errors(evaluator.figures, evaluator.answer_limits),
             target=TARGET,
             episodes=episodes,
             seed=seed,
         )
-    confidence = learned(card, _examples(card, features, metrics), *unanswerable)
+        ordinary = _examples(card, features, metrics)
+        foreseen, unforeseen = _unanswered(
+            policy, env, episodes // EPISODES_PER_UNANSWERABLE, seed, len(card.estimated)
+        )
+    harder = dict(_harder(policy, run, card))
+    confidence = learned(card, ordinary, harder, foreseen, unforeseen)
     try:
         write_atomically(folder / FILE, to_bytes(confidence))
     except OSError as error:
@@ -130,62 +143,77 @@ def calibrate(
     return folder / FILE, confidence.card
 
 
+Kinds = Mapping[str, Examples]
+"""Examples by what is the matter with them."""
+
+
 def learned(
-    card: Card,
-    examples: Examples,
-    foreseen: Mapping[str, Tensor],
-    unforeseen: Mapping[str, Tensor],
+    card: Card, ordinary: Examples, harder: Kinds, foreseen: Kinds, unforeseen: Kinds
 ) -> Confidence:
     """A confidence that was fitted, given its threshold, and measured, each in a part of its own.
 
     Args:
         card: what is known before.
-        examples: of first actions.
-        foreseen: by kind, features (m, F) of what can't be answered.
-        unforeseen: the same of kinds that are left for the measuring.
+        ordinary: of the task that the policy was trained for.
+        harder: of others.
+        foreseen: before what can't be answered.
+        unforeseen: the same, left for the measuring.
     """
-    fitted, chosen, measured = _parts(len(examples))
-    confidence = Confidence(card)
-    none = _unanswerable_examples(card, [each[_parts(len(each))[0]] for each in foreseen.values()])
-    fit(confidence, examples[fitted], none, card.seed)
-    rescale(confidence, examples[chosen])
+    confidence, chosen = Confidence(card), ordinary[_parts(ordinary)[1]]
+    others = [each[_parts(each)[0]] for each in (*harder.values(), *foreseen.values())]
+    fit(confidence, ordinary[_parts(ordinary)[0]], joined([chosen[:0], *others]), card.seed)
+    rescale(confidence, chosen)
+    refused = joined([chosen[:0], *(each[_parts(each)[1]] for each in foreseen.values())])
     with torch.no_grad():
-        far = ordinary_distance(confidence.distance(examples.features[chosen]))
+        far = ordinary_distance(confidence.distance(chosen.features))
         confidence.card = card.model_copy(update={"farthest": far})
-        refused = [each[_parts(len(each))[1]] for each in foreseen.values()]
         threshold = choose_threshold(
-            confidence(examples.features[chosen]).probability.numpy(),
-            examples.right[chosen].numpy(),
-            confidence(torch.cat([*refused, examples.features[:0]])).probability.numpy(),
+            confidence(chosen.features).probability.numpy(),
+            chosen.right.numpy(),
+            confidence(refused.features).probability.numpy(),
             1.0 - MISTAKES_ALLOWED * (1.0 - card.target),
         )
-        confidence.card = confidence.card.model_copy(update={"threshold": threshold})
-        kinds = {kind: each[_parts(len(each))[2]] for kind, each in foreseen.items()}
-        report = _measured(confidence, examples[measured], {**kinds, **unforeseen})
-        confidence.card = confidence.card.model_copy(update={"measured": report})
+    confidence.card = confidence.card.model_copy(update={"threshold": threshold})
+    rest = {kind: each[_parts(each)[2]] for kind, each in foreseen.items()}
+    measured = Measured(
+        ordinary=_counts(confidence, ordinary[_parts(ordinary)[2]]),
+        harder={what: _counts(confidence, each[_parts(each)[2]]) for what, each in harder.items()},
+        unanswerable={
+            k: _counts(confidence, each) for k, each in (rest | dict(unforeseen)).items()
+        },
+    )
+    confidence.card = confidence.card.model_copy(update={"measured": measured})
     return confidence.eval()
 
 
-def _parts(count: int) -> tuple[slice, slice, slice]:
+def _parts(examples: Examples) -> tuple[slice, slice, slice]:
     """Rows to fit with, to choose the threshold with, and to measure with."""
+    count = len(examples)
     first, second = int(SHARES[0] * count), int(sum(SHARES) * count)
     return slice(0, first), slice(first, second), slice(second, count)
 
 
-def _measured(
-    confidence: Confidence, examples: Examples, unanswerable: Mapping[str, Tensor]
-) -> Measured:
-    sure = confidence(examples.features).sure
-    return Measured(
-        episodes=len(examples),
-        right=float(examples.right.float().mean()),
-        coverage=float(sure.float().mean()),
-        sure_right=float(examples.right[sure].float().mean()) if sure.any() else None,
-        unanswerable={
-            kind: (len(each), int(confidence(each).sure.sum()))
-            for kind, each in unanswerable.items()
-        },
+@torch.no_grad()
+def _counts(confidence: Confidence, examples: Examples) -> Counts:
+    right, sure = examples.right, confidence(examples.features).sure
+    return Counts(
+        actions=len(examples),
+        right=int(right.sum()),
+        sure=int(sure.sum()),
+        sure_right=int((right & sure).sum()),
     )
+
+
+def _harder(policy: Policy, run: RunSettings, card: Card) -> Iterator[tuple[str, Examples]]:
+    """Examples of the harder tasks that can be had, by what is harder in them."""
+    count = card.episodes // EPISODES_PER_HARDER
+    for what, settings in run.environment.cls.harder(run.environment.settings).items():
+        other = replace(run, environment=replace(run.environment, settings=settings))
+        with closing(evaluation_environment(other, count)) as env:
+            try:
+                yield what, _examples(card, *_answered(policy, env, count, FIRST_SEED + card.seed))
+            except ValueError as error:
+                _logger.warning("%s: left out, for it can't be had here: %s", what, error)
 
 
 def _answered(policy: Policy, env: Environment, episodes: int, seed: int) -> tuple[Tensor, Metrics]:
@@ -222,23 +250,21 @@ def _answered(policy: Policy, env: Environment, episodes: int, seed: int) -> tup
 
 
 def _unanswered(
-    policy: Policy, env: Environment, count: int, seed: int
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Features (count, F) of what can't be answered, by kind: foreseen, and not."""
-    foreseen: dict[str, list[Tensor]] = {}
-    unforeseen: dict[str, list[Tensor]] = {}
+    policy: Policy, env: Environment, count: int, seed: int, errors: int
+) -> tuple[Kinds, Kinds]:
+    """Examples of what can't be answered, so many of each kind: foreseen, and not."""
+    foreseen: dict[str, list[Examples]] = {}
+    unforeseen: dict[str, list[Examples]] = {}
     batch = min(count, env.num_envs)
-    for number in range(-(-count // batch)):
-        # No evaluation and no run seeds anything by more than one number.
-        for each in env.evaluator().unanswerable(
-            batch, FIRST_SEED + seed + number * SEEDS_PER_BATCH
-        ):
-            kinds = foreseen if each.is_foreseen else unforeseen
+    for first in range(0, count, batch):
+        batch_seed = FIRST_SEED + seed + first * SEEDS_PER_BATCH
+        for each in env.evaluator().unanswerable(batch, batch_seed):
             _, features = policy.first_actions(each.observations)
-            kinds.setdefault(each.kind, []).append(features)
+            kinds = foreseen if each.is_foreseen else unforeseen
+            kinds.setdefault(each.kind, []).append(Examples.unanswerable(features, errors))
     return (
-        {kind: torch.cat(parts)[:count] for kind, parts in foreseen.items()},
-        {kind: torch.cat(parts)[:count] for kind, parts in unforeseen.items()},
+        {kind: joined(parts)[:count] for kind, parts in foreseen.items()},
+        {kind: joined(parts)[:count] for kind, parts in unforeseen.items()},
     )
 
 
@@ -252,9 +278,3 @@ def _examples(card: Card, features: Tensor, metrics: Metrics) -> Examples:
         torch.from_numpy(relative).float(),
         torch.from_numpy((values <= limits).all(axis=1)),
     )
-
-
-def _unanswerable_examples(card: Card, features: list[Tensor]) -> Examples:
-    joined = torch.cat([*features, torch.empty(0, card.features)])
-    errors = torch.full((len(joined), len(card.estimated)), torch.inf)
-    return Examples(joined, errors, torch.zeros(len(joined), dtype=torch.bool))

@@ -22,6 +22,7 @@ from envs.grasp.deployment import deployment
 from envs.grasp.episode_state import RunningEpisodes
 from envs.grasp.evaluation.evaluator import EVALUATION_OPTIONS, GraspEvaluator
 from envs.grasp.evaluation.pose_commands import PoseCommands
+from envs.grasp.harder import harder
 from envs.grasp.observations import (
     PRIVILEGED,
     observation_space,
@@ -159,6 +160,12 @@ class GraspVectorEnv(Environment):
         """See `Environment.deployment`."""
         assert isinstance(settings, GraspSettings)
         return deployment(settings)
+
+    @classmethod
+    def harder(cls, settings: BaseModel) -> dict[str, GraspSettings]:
+        """See `Environment.harder`."""
+        assert isinstance(settings, GraspSettings)
+        return harder(settings)
 
     # -- training's interface --------------------------------------------------------------------
 

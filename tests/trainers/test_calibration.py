@@ -19,7 +19,8 @@ from trainers.common.errors import UserError
 from trainers.evaluation import FIRST_SEED as FIRST_EVALUATED
 from trainers.evaluation import SEED_LIMIT, SEEDS_PER_BATCH
 from trainers.export import main as export
-from trainers.inference.confidence import FILE
+from trainers.inference.confidence import FILE, Card, JudgedError
+from trainers.inference.confidence_fit import Examples
 from trainers.inference.fitting import load_raw_policy
 from trainers.inference.onnx_policy import OnnxPolicy
 from trainers.inference.policy import Policy
@@ -48,7 +49,10 @@ def calibrate(results: Path, *options: str, name: str = "toy") -> int:
 
 @pytest.mark.parametrize("trainer", ["ppo", "ddpg"])
 def test_a_policy_knows_when_it_hits(
-    learned: Callable[..., Path], trainer: str, capfd: pytest.CaptureFixture[str]
+    learned: Callable[..., Path],
+    trainer: str,
+    capfd: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Hardly trained it hits what is near the middle, and what is off the board never."""
     results = learned(trainer={"trainer_type": trainer})
@@ -57,7 +61,10 @@ def test_a_policy_knows_when_it_hits(
     assert calibrate(results) == DONE
     said = capfd.readouterr().out
     assert "right is at most: distance 70.00 cm" in said
-    assert "sure before elsewhere: 0 of 50" in said
+    assert "  elsewhere: sure 0 of 50\n" in said
+    assert "  one throw: " in said
+    assert "  no throw: " not in said
+    assert "no throw: left out, for it can't be had here: nobody may throw" in caplog.text
     policy = Policy.load("toy", results_dir=results)
     goals = np.random.default_rng(0).uniform(-0.8, 0.8, (400, 2)).astype(np.float32)
     answer = policy.answer(goals)
@@ -74,6 +81,49 @@ def test_a_policy_knows_when_it_hits(
     assert one.actions.shape == (2,)
     assert one.sure.shape == one.probability.shape == one.errors["distance_m"].shape == ()
     assert not policy.answer(10.0 * goals).sure[np.abs(goals).max(1) > 0.5].any()
+
+
+def test_each_part_of_the_episodes_serves_one_purpose(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Examples are numbered by a feature; what is fitted with is not measured with."""
+    error = JudgedError(metric="size", limit=1.0, label="size")
+    card = Card(features=1, errors=(error,), weights_sha256="", target=0.9, episodes=0, seed=0)
+    seen: dict[str, list[float]] = {}
+
+    def numbered(first: int, right: bool) -> Examples:
+        return Examples(
+            torch.arange(first, first + 200.0)[:, None],
+            torch.zeros(200, 1),
+            torch.full((200,), right),
+        )
+
+    def recorded(name: str, at: int) -> Any:
+        original = getattr(calibration, name)
+
+        def record(*arguments: Any) -> Any:
+            for examples in arguments[1:at]:
+                seen.setdefault(name, []).extend(examples.features[:, 0].tolist())
+            return original(*arguments)
+
+        return record
+
+    for name, at in (("fit", 3), ("rescale", 2), ("_counts", 2)):
+        monkeypatch.setattr(calibration, name, recorded(name, at))
+    calibration.learned(
+        card,
+        numbered(0, right=True),
+        {"windy": numbered(1000, right=True)},
+        {"dark": numbered(2000, right=False)},
+        {"odd": numbered(3000, right=False)},
+    )
+    fitted, chosen, measured = (set(seen[name]) for name in ("fit", "rescale", "_counts"))
+    assert not fitted & chosen
+    assert not fitted & measured
+    assert not chosen & measured
+    assert chosen < set(numbered(0, right=True).features[:, 0].tolist())
+    assert set(numbered(3000, right=False).features[:, 0].tolist()) < measured
+    assert len(fitted & set(map(float, range(1000, 1200)))) == 110
 
 
 def test_it_goes_where_the_weights_go(
@@ -146,7 +196,7 @@ def test_nothing_is_sure_where_it_can_not_be_shown(
     assert calibrate(results) == DONE
     said = capfd.readouterr().out
     assert "NOTHING IS SURE: 100.0% right could not be shown" in said
-    assert "sure: 0.00%, of which none are right" in said
+    assert "right; sure 0.00%\n" in said
     assert (
         not Policy.load("toy", results_dir=results).answer(np.zeros((9, 2), np.float32)).sure.any()
     )

@@ -6,7 +6,7 @@ It is stored beside the weights that it was fitted to, and is of no use with oth
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -68,22 +68,34 @@ class JudgedError(BaseModel, frozen=True, extra="forbid"):
         )
 
 
+class Counts(BaseModel, frozen=True, extra="forbid"):
+    """What came of some first actions.
+
+    Attributes:
+        actions: how many there were.
+        right: how many of them were right.
+        sure: how many were called sure.
+        sure_right: how many of those were right.
+    """
+
+    actions: NonNegativeInt
+    right: NonNegativeInt
+    sure: NonNegativeInt
+    sure_right: NonNegativeInt
+
+
 class Measured(BaseModel, frozen=True, extra="forbid"):
     """What came of it in episodes that served nothing else.
 
     Attributes:
-        episodes: whose first actions were judged.
-        right: share of them that was right.
-        coverage: share of them that was called sure.
-        sure_right: share of the sure ones that was right; None where there were none.
-        unanswerable: by kind, how many observations there were, and how many were called sure.
+        ordinary: of the task that the policy was trained for.
+        harder: of others, by what was harder in them.
+        unanswerable: by kind, before what can't be answered; none of these actions is right.
     """
 
-    episodes: NonNegativeInt
-    right: float
-    coverage: float
-    sure_right: float | None
-    unanswerable: dict[str, tuple[int, int]] = {}
+    ordinary: Counts
+    harder: dict[str, Counts] = {}
+    unanswerable: dict[str, Counts] = {}
 
 
 class Card(BaseModel, frozen=True, extra="forbid"):
@@ -247,7 +259,9 @@ def _again(folder: Path) -> str:
     return f"delete it, and run `python -m trainers.calibrate {folder}`"
 
 
-def judged_errors(figures: Sequence[Figure], limits: dict[str, float]) -> tuple[JudgedError, ...]:
+def judged_errors(
+    figures: Sequence[Figure], limits: Mapping[str, float]
+) -> tuple[JudgedError, ...]:
     """The errors that an environment declares, as its figures show them."""
     known = {figure.metric: figure for figure in figures}
     return tuple(

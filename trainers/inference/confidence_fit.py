@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Self
 
@@ -51,29 +52,36 @@ class Examples:
     def __getitem__(self, rows: slice) -> Self:
         return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
 
-    def with_rows_of(self, other: Examples) -> Examples:
-        """These and others."""
-        names = [field.name for field in fields(self)]
-        return Examples(*(torch.cat([getattr(self, k), getattr(other, k)]) for k in names))
+    @classmethod
+    def unanswerable(cls, features: Tensor, errors: int) -> Self:
+        """Examples (n, F) none of which is right, with so many errors."""
+        n = len(features)
+        return cls(features, torch.full((n, errors), torch.inf), torch.zeros(n, dtype=torch.bool))
 
 
-def fit(confidence: Confidence, answerable: Examples, unanswerable: Examples, seed: int) -> None:
+def joined(parts: Sequence[Examples]) -> Examples:
+    """One after the other; there must be one part."""
+    names = [field.name for field in fields(Examples)]
+    return Examples(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+
+
+def fit(confidence: Confidence, ordinary: Examples, others: Examples, seed: int) -> None:
     """Fits all but the thresholds.
 
     Args:
         confidence: changed.
-        answerable: as they come; what features are ordinarily is told by them.
-        unanswerable: there may be none.
+        ordinary: of the task that the policy was trained for; they tell what features are like.
+        others: harder ones, and before what can't be answered; there may be none.
         seed: of what is drawn.
     """
-    _fit_distance(confidence, answerable.features)
+    _fit_distance(confidence, ordinary.features)
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         for layer in confidence.head:
             if isinstance(layer, nn.Linear):
                 layer.reset_parameters()
-    examples = answerable.with_rows_of(unanswerable)
+    examples = joined([ordinary, others])
     inputs = confidence.standardized(examples.features)
     right = examples.right.float()
     over = (examples.errors[:, :, None] > torch.tensor(STEPS_OF_LIMIT)).float()
