@@ -163,7 +163,9 @@ def test_a_workers_exception_is_passed_on_and_leaves_no_answer_behind(
     )
 
 
-def test_workers_end_when_the_parent_closes() -> None:
+def test_workers_end_when_the_parent_closes(monkeypatch: pytest.MonkeyPatch) -> None:
+    # They have hardly started, which takes its time beside other work; none may have to be killed.
+    monkeypatch.setattr("envs.grasp.simulators.workers.CLOSE_TIMEOUT_S", 60.0)
     simulator = ParallelSimulator(4, 2, ROBOT, Support())
     workers = [worker._process for worker in simulator._workers]
     assert len({worker.pid for worker in workers} | {os.getpid()}) == 3
