@@ -12,21 +12,22 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, PositiveInt
 from torch import nn
-from torch.nn import functional as F
 
 from encoders.inputs import fill_gaps
 from encoders.layers import dense
-from encoders.spaces import DepthImage
-
-# Coordinates are decimetres, so that the size of a block is near 1.
-UNITS_PER_M = 10.0
-KEYPOINT_SCALE = 1.0 / 3.0
-LARGEST_COVARIANCE = 3.0
-# Sharp enough at the start that no two keypoints are the mean of all points.
-ATTENTION_GAIN = 4.0
-UNSEEN = -1e4  # the logit of what the camera does not see
-COORDINATES = 3
-MOMENTS = 6
+from encoders.points import (
+    ATTENTION_GAIN,
+    COORDINATES,
+    MOMENTS,
+    UNITS_PER_M,
+    UNSEEN,
+    attended,
+    known_camera,
+    middles,
+    patch_rays,
+    patches,
+    second_moments,
+)
 
 
 class Keypoints(nn.Module):
@@ -73,7 +74,7 @@ class Keypoints(nn.Module):
 
     def __init__(self, space: Box, settings: Settings) -> None:
         super().__init__()
-        self.space = _known_camera(space)
+        self.space = known_camera(space)
         height, width, _ = space.shape
         if min(height, width) < settings.patch:
             raise ValueError(
@@ -83,7 +84,6 @@ class Keypoints(nn.Module):
         self._patch, self._stride = settings.patch, settings.stride
         self._clip_m = settings.clip_m
         self._lowered = settings.precision == "bfloat16"
-        self._padding = max(settings.patch - settings.stride, 0) // 2
         hidden, count = settings.hidden_units, settings.keypoints
         self.shape = dense(settings.patch**2, hidden, "relu")
         self.place = dense(hidden + COORDINATES, hidden, "relu")
@@ -109,7 +109,8 @@ class Keypoints(nn.Module):
             logits = self.attention(described).masked_fill(~seen[..., None], UNSEEN)
         with torch.autocast(raw.device.type, enabled=False):
             attention = logits.float().softmax(dim=1).transpose(1, 2)
-            return torch.cat(self._gather(attention, points, self.values(described.float())), 1)
+            values = self.values(described.float())
+            return attended(attention, points, second_moments(points), values)
 
     def set_rays(self, rays: NDArray[np.float64]) -> None:
         """Looks through another camera than the space's.
@@ -130,12 +131,12 @@ class Keypoints(nn.Module):
         Depths are infinite where nothing was seen, which in a patch counts as far as can be.
         """
         # In units of the clip: once for each pixel, not for all the patches that it is in.
-        patches = self._patches(depth_m * (1.0 / self._clip_m))
-        middles = self._middles(patches)
-        seen = middles.isfinite()
-        middles = middles.clamp(max=self.space.range_m[1] / self._clip_m)
-        shapes = (patches - middles[..., None, None]).clamp_(-1.0, 1.0)
-        middle_m = middles * self._clip_m
+        of_patches = patches(depth_m * (1.0 / self._clip_m), self._patch, self._stride)
+        middle = middles(of_patches)
+        seen = middle.isfinite()
+        middle = middle.clamp(max=self.space.range_m[1] / self._clip_m)
+        shapes = (of_patches - middle[..., None, None]).clamp_(-1.0, 1.0)
+        middle_m = middle * self._clip_m
         points = middle_m[..., None] * self.rays
         points[..., 2] -= self._middle_m
         return (
@@ -144,39 +145,6 @@ class Keypoints(nn.Module):
             seen.flatten(1),
         )
 
-    def _gather(
-        self, attention: torch.Tensor, points: torch.Tensor, values: torch.Tensor
-    ) -> list[torch.Tensor]:
-        """Mean points, their covariances and mean values under K attention maps (B, K, n)."""
-        rows, columns = torch.triu_indices(COORDINATES, COORDINATES, device=points.device)
-        squares = points[..., rows] * points[..., columns]
-        means = attention @ torch.cat([points, squares, values], dim=-1)
-        place, square, value = means.split([COORDINATES, MOMENTS, values.shape[-1]], dim=-1)
-        # Cov(x, y) = E[x y] - E[x] E[y]
-        covariance = square - place[..., rows] * place[..., columns]
-        bounded = covariance.clamp(-LARGEST_COVARIANCE, LARGEST_COVARIANCE)
-        return [(place * KEYPOINT_SCALE).flatten(1), bounded.flatten(1), value.flatten(1)]
-
-    def _patches(self, images: torch.Tensor) -> torch.Tensor:
-        """Images (B, H, W) -> their patches (B, h, w, p, p)."""
-        padded = F.pad(images[:, None], (self._padding,) * 4, mode="replicate")[:, 0]
-        return padded.unfold(1, self._patch, self._stride).unfold(2, self._patch, self._stride)
-
     def _patch_rays(self, rays: NDArray[np.float64]) -> torch.Tensor:
         """Rays of pixels (H, W, 3) -> those of patches' middles (h, w, 3), float32."""
-        coordinates = torch.from_numpy(rays).float().permute(2, 0, 1)
-        return self._middles(self._patches(coordinates)).movedim(0, -1).contiguous()
-
-    def _middles(self, patches: torch.Tensor) -> torch.Tensor:
-        """The pixels (B, h, w) in the middles of patches (B, h, w, p, p)."""
-        return patches[..., self._patch // 2, self._patch // 2]
-
-
-def _known_camera(space: Box) -> DepthImage:
-    if not isinstance(space, DepthImage):
-        raise ValueError("only depth images (encoders.spaces.DepthImage) can be turned into points")
-    if space.pinhole is None:
-        raise ValueError(
-            "the depth image does not know its camera: declare its DepthImage with a pinhole"
-        )
-    return space
+        return patch_rays(torch.from_numpy(rays).float(), self._patch, self._stride)
