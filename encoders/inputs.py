@@ -14,6 +14,12 @@ from torch.nn import functional as F
 from encoders.spaces import UINT8_MAX, DepthImage
 
 
+# Farther than any camera sees, and no less exact a number than a depth.
+FAR_AWAY_M = 1e4
+# Turns metres into 0 or 1, but for a nanometre between them.
+STEEP = 1e9
+
+
 class ImageSettings(BaseModel, frozen=True, extra="forbid"):
     """Settings of every encoder of whole images."""
 
@@ -103,6 +109,35 @@ def fill_gaps(depth_m: torch.Tensor) -> torch.Tensor:
     for down, right in ((1, 0), (1, 1), (1, -1)):
         filled.clamp_(max=farther(down, right))
     return torch.where(depth_m == math.inf, filled, depth_m)
+
+
+def nearest_surfaces(
+    depth_m: torch.Tensor, side: int, thickness_m: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The nearest surface in each cell of an image.
+
+    Args:
+        depth_m: (B, H, W), infinite where nothing was seen; H and W are multiples of the side.
+        side: of a cell in pixels.
+        thickness_m: pixels less than this behind a cell's nearest lie on its surface.
+
+    Returns:
+        Three maps (B, H / side, W / side): the mean depth of the surface's pixels, infinite where
+        a cell has none; the share of the cell's pixels that lie on it; the share where nothing was
+        seen.
+    """
+    # One plane for each place in a cell: sums over planes are over long rows of memory.
+    cells = depth_m.unflatten(2, (-1, side)).unflatten(1, (-1, side))
+    pixels = cells.permute(0, 2, 4, 1, 3).flatten(1, 2).clamp(max=FAR_AWAY_M)
+    # Clamped numbers in place of comparisons, which take torch five to ten times as long on a CPU.
+    behind_m = pixels - pixels.amin(dim=1, keepdim=True)
+    on_it = behind_m.sub_(thickness_m).mul_(-STEEP).clamp_(0.0, 1.0)
+    count, total_m = on_it.sum(dim=1), (on_it * pixels).sum(dim=1)
+    mean_m = total_m / count
+    missing = pixels.sub_(FAR_AWAY_M / 2).clamp_(0.0, 1.0).sum(dim=1)
+    seen = mean_m < FAR_AWAY_M / 2
+    share = 1.0 / side**2
+    return mean_m.masked_fill(~seen, math.inf), count * seen * share, missing * share
 
 
 class VectorInput(nn.Module):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
-from encoders.inputs import fill_gaps, image_input, vector_input
+from encoders.inputs import fill_gaps, image_input, nearest_surfaces, vector_input
 from encoders.spaces import DepthImage, RgbImage
 
 
@@ -110,3 +110,34 @@ def test_vectors_become_float32():
 def test_matrices_are_neither_images_nor_vectors(build):
     with pytest.raises(ValueError, match=r"\(4, 5\).*neither"):
         build(Box(-1, 1, (4, 5)))
+
+
+def test_the_nearest_surface_of_a_cell_is_the_mean_of_the_pixels_on_it():
+    inf = torch.inf
+    depth_m = torch.tensor([[1.00, 1.02, inf, inf], [1.01, 1.50, inf, 0.70]])[None]
+    mean_m, coverage, missing = nearest_surfaces(depth_m, 2, 0.03)
+    torch.testing.assert_close(mean_m, torch.tensor([[[1.01, 0.70]]]))
+    torch.testing.assert_close(coverage, torch.tensor([[[0.75, 0.25]]]))
+    torch.testing.assert_close(missing, torch.tensor([[[0.0, 0.75]]]))
+
+
+def test_a_cell_without_a_depth_has_no_surface():
+    mean_m, coverage, missing = nearest_surfaces(torch.full((1, 3, 3), torch.inf), 3, 0.03)
+    assert (mean_m.item(), coverage.item(), missing.item()) == (torch.inf, 0.0, 1.0)
+
+
+def test_cells_are_where_their_pixels_are():
+    depth_m = torch.arange(24.0).reshape(1, 4, 6)
+    mean_m, *_ = nearest_surfaces(depth_m, 2, 100.0)
+    expected = depth_m.numpy().reshape(2, 2, 3, 2).mean((1, 3))
+    torch.testing.assert_close(mean_m[0], torch.from_numpy(expected))
+
+
+def test_cells_of_one_pixel_are_the_image_which_stays_as_it_is():
+    depth_m = torch.tensor([[[0.5, torch.inf], [1.5, 2.0]]])
+    before = depth_m.clone()
+    mean_m, coverage, missing = nearest_surfaces(depth_m, 1, 0.03)
+    assert torch.equal(depth_m, before)
+    assert torch.equal(mean_m, before)
+    assert coverage.tolist() == [[[1.0, 0.0], [1.0, 1.0]]]
+    assert missing.tolist() == [[[0.0, 1.0], [0.0, 0.0]]]
