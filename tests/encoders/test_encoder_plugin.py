@@ -29,6 +29,7 @@ def test_all_built_in_encoders_are_registered():
         "resnet",
         "fully_connected",
         "keypoints",
+        "second_look",
         "vector",
     }
 

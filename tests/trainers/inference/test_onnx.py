@@ -18,6 +18,7 @@ from encoders.cameras import Pinhole, Sampling
 from encoders.conv import Conv, Paper
 from encoders.keypoints import Keypoints
 from encoders.ml_agents import FullyConnected, NatureCnn, ResNet, Simple
+from encoders.second_look import SecondLook
 from encoders.spaces import DepthImage, RgbImage
 from encoders.vector import Vector
 from envs.deployment import Deployment
@@ -45,6 +46,7 @@ COLOR = RgbImage(38, 40, SENSOR)
 EVERYTHING = {
     "paper": (DEPTH, Paper, {"validity_channel": True}),
     "keypoints": (DEPTH, Keypoints, {"keypoints": 3, "precision": "float32"}),
+    "second_look": (DEPTH, SecondLook, {"first_keypoints": 3, "second_keypoints": 3}),
     "conv": (COLOR, Conv, {"layers": [(4, 8, 4)]}),
     "simple": (CODED, Simple, {"features": 5}),
     "nature_cnn": (COLOR, NatureCnn, {"features": 5}),
