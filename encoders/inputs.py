@@ -13,7 +13,6 @@ from torch.nn import functional as F
 
 from encoders.spaces import UINT8_MAX, DepthImage
 
-
 # Farther than any camera sees, and no less exact a number than a depth.
 FAR_AWAY_M = 1e4
 # Turns metres into 0 or 1, but for a nanometre between them.

@@ -105,7 +105,8 @@ def _set_rays(network: PolicyNetwork, name: str, rays: NDArray[np.float64]) -> N
             raise UserError(
                 f"--camera: the encoder of {name!r} ({type(encoder).__name__}) knows no rays of "
                 "pixels, so that it can't be fitted to other intrinsics than those of training: "
-                "train with the real camera's intrinsics, or with the encoder keypoints or second_look"
+                "train with the real camera's intrinsics, or with the encoder keypoints or "
+                "second_look"
             )
         encoder.set_rays(rays)
 
