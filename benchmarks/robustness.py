@@ -23,10 +23,20 @@ from benchmarks.tables import markdown, table, write_between
 from envs.grasp.settings import GraspSettings
 from trainers.common.errors import UserError
 from trainers.evaluation import evaluate, find_run
+from trainers.reporting.figures import SURE, SURE_RIGHT
 from trainers.runfile.settings import RunSettings
 
 FAULTS_FILE = Path(__file__).with_suffix(".yaml")
-HEAD = ("fault", "strength", "simulator", "first action", "position (mm)", "yaw (deg)")
+HEAD = (
+    "fault",
+    "strength",
+    "simulator",
+    "first action",
+    "position (mm)",
+    "yaw (deg)",
+    "sure",
+    "of which right",
+)
 SIMULATORS = ("fast", "pybullet")
 
 
@@ -131,7 +141,10 @@ def measure(
 
 
 def row(fault: Fault, simulator: str, report: dict[str, Any]) -> list[str]:
-    """The cells of a fault: success, and medians / 95th percentiles of the errors."""
+    """The cells of a fault: success, medians / 95th percentiles of the errors, and sureness.
+
+    The last two are empty where the policy has not learned how sure it is, or is never sure.
+    """
     position, yaw = report["position_error_m"], report["yaw_error_deg"]
     return [
         fault.text,
@@ -140,6 +153,7 @@ def row(fault: Fault, simulator: str, report: dict[str, Any]) -> list[str]:
         f"{report['first_action_success']:.1%}",
         f"{position['median'] * 1000.0:.1f} / {position['p95'] * 1000.0:.1f}",
         f"{yaw['median']:.2f} / {yaw['p95']:.2f}",
+        *(f"{report[name]:.1%}" if name in report else "" for name in (SURE, SURE_RIGHT)),
     ]
 
 

@@ -27,6 +27,7 @@ from trainers.reporting.figures import (
     first_action_figures,
     report_figures,
     summaries,
+    sureness_report,
 )
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import RunSettings, load_run, load_run_document
@@ -72,6 +73,34 @@ class SavedPolicy(ActingPolicy, Protocol):
 
     observation_space: gymnasium.spaces.Dict
     action_space: gymnasium.Space[Any]
+
+
+class AnsweringPolicy:
+    """A policy that keeps how sure it was of its best actions.
+
+    Args:
+        policy: acts, and knows how sure it is.
+
+    Attributes:
+        sure: (B,) of each call for best actions.
+    """
+
+    def __init__(self, policy: Policy):
+        self._policy = policy
+        self.sure: list[NDArray[np.bool_]] = []
+
+    def predict(
+        self,
+        observations: Mapping[str, NDArray[Any]],
+        state: NDArray[Any] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], NDArray[Any] | None]:
+        """See `ActingPolicy.predict`; the policy has no memory."""
+        if not deterministic:
+            return self._policy.predict(observations, state, deterministic)
+        answer = self._policy.answer(observations)
+        self.sure.append(answer.sure)
+        return answer.actions, state
 
 
 @dataclass(frozen=True)
@@ -240,8 +269,9 @@ def evaluate_policy(
         `episodes`, `seed`; of the whole episodes `success`, where it is known, the environment's
         figures, the means `reward` and `episode_length`, and `reward_std`. Where the first action
         is judged its rates have `first_action_` before their names, and errors are those of the
-        first action alone. With a physical check NAME: `NAME_rate`, and the shares of
-        `NAME_failures`.
+        first action alone. Of a policy that knows how sure it is: `sure`, the share of the first
+        actions, and `sure_right`, the share of those that are right, where there are any. With a
+        physical check NAME: `NAME_rate`, and the shares of `NAME_failures`.
 
     Raises:
         UserError: the environment does not report what its figures are made of.
@@ -252,11 +282,17 @@ def evaluate_policy(
     first_seed = FIRST_SEED + 2 * seed
     first: dict[str, Any] = {}
     if evaluator.judges_first_action or check is not None or pictures is not None:
+        answering = None
+        if isinstance(policy, Policy) and policy.confidence is not None:
+            answering = AnsweringPolicy(policy)
         metrics, outcomes = first_actions(
-            policy, env_runner, episodes, first_seed + FIRST_ACTION, check, pictures
+            answering or policy, env_runner, episodes, first_seed + FIRST_ACTION, check, pictures
         )
         if evaluator.judges_first_action:
             first |= summaries(first_action_figures(evaluator), metrics)
+        if answering is not None:
+            sure = np.concatenate(answering.sure)[:episodes]
+            first |= sureness_report(sure, evaluator.answer_limits, metrics)
         first |= check_report(evaluator.check_name, outcomes)
     played = _whole_episodes(
         policy,

@@ -25,6 +25,8 @@ def report(success: float) -> dict[str, Any]:
         "first_action_success": success,
         "position_error_m": {"median": 0.0024, "p95": 0.006, "x": 0.0},
         "yaw_error_deg": {"median": 0.234, "p95": 0.8},
+        "sure": 0.8,
+        "sure_right": 0.995,
     }
 
 
@@ -75,7 +77,7 @@ def test_there_is_a_row_for_each_fault_and_simulator_on_the_same_scenes(
     ]
     rows = page.read_text().splitlines()[3:-1]
     assert len(rows) == 2 * len(FAULTS)
-    assert rows[0] == "| as trained |  | fast | 90.0% | 2.4 / 6.0 | 0.23 / 0.80 |"
+    assert rows[0] == "| as trained |  | fast | 90.0% | 2.4 / 6.0 | 0.23 / 0.80 | 80.0% | 99.5% |"
     assert re.search(r"│ half +│ fast +│ +90.0%", capsys.readouterr().out)
 
 
@@ -98,3 +100,11 @@ def test_a_policy_without_first_actions_is_refused(
 def test_a_policy_that_is_not_there_is_a_mistake(capsys: pytest.CaptureFixture[str]) -> None:
     assert robustness.main(["no/such/run", "--episodes", "1"]) == MISTAKE
     assert "no/such/run" in capsys.readouterr().err
+
+
+def test_a_policy_that_is_never_sure_has_nothing_right_among_it() -> None:
+    fault, never = FAULTS[0], report(0.9) | {"sure": 0.0}
+    del never["sure_right"]
+    assert robustness.row(fault, "fast", never)[-2:] == ["0.0%", ""]
+    del never["sure"]
+    assert robustness.row(fault, "fast", never)[-2:] == ["", ""]

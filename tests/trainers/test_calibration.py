@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,13 @@ from trainers.calibrate import main
 from trainers.calibration import FIRST_SEED, RecordedPolicy
 from trainers.common.errors import UserError
 from trainers.evaluation import FIRST_SEED as FIRST_EVALUATED
-from trainers.evaluation import SEED_LIMIT, SEEDS_PER_BATCH
+from trainers.evaluation import (
+    SEED_LIMIT,
+    SEEDS_PER_BATCH,
+    evaluate,
+    evaluation_environment,
+    find_run,
+)
 from trainers.export import main as export
 from trainers.inference.confidence import FILE, Card, JudgedError
 from trainers.inference.confidence_fit import Examples
@@ -26,6 +33,7 @@ from trainers.inference.onnx_policy import OnnxPolicy
 from trainers.inference.policy import Policy
 from trainers.learn import DONE, MISTAKE
 from trainers.networks.actor_critic import ActorCritic
+from trainers.reporting.figures import SURE, SURE_RIGHT
 from trainers.runfile.registry import Registries
 from trainers.saving.run_folder import find_checkpoint
 
@@ -81,6 +89,31 @@ def test_a_policy_knows_when_it_hits(
     assert one.actions.shape == (2,)
     assert one.sure.shape == one.probability.shape == one.errors["distance_m"].shape == ()
     assert not policy.answer(10.0 * goals).sure[np.abs(goals).max(1) > 0.5].any()
+
+
+def test_an_evaluation_says_how_often_a_policy_is_sure_and_then_right(
+    learned: Callable[..., Path],
+) -> None:
+    results = learned(trainer={"trainer_type": "ddpg"})
+    before = evaluate("toy", episodes=300, results_dir=results).report
+    assert before.keys().isdisjoint({SURE, SURE_RIGHT})
+    assert calibrate(results) == DONE
+    evaluation = evaluate("toy", episodes=300, results_dir=results)
+    assert {k: v for k, v in evaluation.report.items() if k not in (SURE, SURE_RIGHT)} == before
+    _, run = find_run("toy", (), results)
+    policy = Policy.load("toy", results_dir=results)
+    with closing(evaluation_environment(run, 300)) as env:
+        answers, distances = [], []
+        for batch in range(300 // env.num_envs):
+            goals, _ = env.reset(seed=FIRST_EVALUATED + batch * SEEDS_PER_BATCH)
+            answers.append(policy.answer(goals))
+            metrics = env.step(answers[-1].actions)[-1]["episode_metrics"]
+            distances.append(metrics["distance_m"])
+    sure, right = np.concatenate([a.sure for a in answers]), np.concatenate(distances) <= 0.7
+    assert evaluation.report[SURE] == pytest.approx(sure.mean())
+    assert evaluation.report[SURE_RIGHT] == pytest.approx(right[sure].mean())
+    assert 0.0 < sure.mean() < 1.0
+    assert evaluation.figures[SURE].shown(0.5) == "50.0%"
 
 
 def test_each_part_of_the_episodes_serves_one_purpose(

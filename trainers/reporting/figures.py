@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from envs.evaluation import SUCCESS, Evaluator, Figure, rate
@@ -13,6 +14,8 @@ from trainers.common.errors import UserError, suggestion
 Metrics = Mapping[str, NDArray[Any]]
 """By name (k,), what was reported of k episodes, or of k actions."""
 
+
+SURE, SURE_RIGHT = "sure", "sure_right"
 
 FACTS = ("step", "episodes", "seed")
 """Entries of a report that say what was evaluated, and are no figures."""
@@ -36,6 +39,8 @@ def report_figures(evaluator: Evaluator) -> dict[str, Figure]:
         Figure("reward", "reward"),
         *episode_figures(evaluator),
         *first_action_figures(evaluator),
+        rate(SURE, "first action: sure"),
+        rate(SURE_RIGHT, "first action: right where sure"),
         rate(f"{name}_rate", f"{label} rate"),
         rate(f"{name}_failures", f"{label} failures", better="lower"),
     )
@@ -75,3 +80,20 @@ def check_report(name: str, outcomes: Metrics) -> dict[str, Any]:
         return {}
     rates = {outcome: float(rows.mean()) for outcome, rows in outcomes.items()}
     return {f"{name}_rate": rates.pop(SUCCESS.metric), f"{name}_failures": rates}
+
+
+def sureness_report(
+    sure: NDArray[np.bool_], limits: Mapping[str, float], metrics: Metrics
+) -> dict[str, float]:
+    """How often a policy is sure (k,), and how many of those actions are right.
+
+    Args:
+        sure: whether it is, of k actions.
+        limits: an action is right where none of these metrics is over its limit.
+        metrics: of the same k actions.
+    """
+    report = {SURE: float(sure.mean())}
+    if limits and sure.any():
+        right = np.all([metrics[name] <= limit for name, limit in limits.items()], axis=0)
+        report[SURE_RIGHT] = float(right[sure].mean())
+    return report
