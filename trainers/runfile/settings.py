@@ -16,6 +16,7 @@ from pydantic import BaseModel, Field, TypeAdapter
 from curricula.samplers import ParameterValue
 from trainers.common.errors import suggestion
 from trainers.runfile.former_keys import brought_up_to_date, tell
+from trainers.runfile.inheritance import read_run_file
 from trainers.runfile.registry import Registries, Registry, UnknownComponentError
 from trainers.runfile.validation import InvalidError, Model, not_finite, validate
 from trainers.runfile.yaml_document import (
@@ -159,7 +160,7 @@ def load_run(path: Path, overrides: Sequence[str], registries: Registries) -> Ru
     Raises:
         SettingsError: with everything that is wrong, where it stands, and what is allowed.
     """
-    return load_run_document(read(path), overrides, registries)
+    return load_run_document(read_run_file(path), overrides, registries)
 
 
 def load_run_document(
