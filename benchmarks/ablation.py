@@ -1,10 +1,10 @@
-"""What each part of the recipe is worth: `config/run.yaml` with one change at a time.
+"""What each part of a recipe is worth: a run file with one change at a time.
 
-    python -m benchmarks.ablation [--page docs/recipe.md]
+    python -m benchmarks.ablation [run | structured_light] [--page docs/recipe.md]
 
-The changes are in `benchmarks/ablation.yaml`. Each row is trained from scratch for the same number
-of steps with each seed, and evaluated with `trainers.evaluate`. Each run leaves a file of results,
-and what is there is not trained again.
+The run files are those of `config/`, the changes are in `benchmarks/ablation.yaml`. Each row is
+trained from scratch for the same number of steps with each seed, and evaluated with
+`trainers.evaluate`. Each run leaves a file of results, and what is there is not trained again.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,9 @@ from rich.console import Console
 from benchmarks.command import tells_mistakes
 from benchmarks.runs import ROOT, Job, add_options, run_missing
 from benchmarks.tables import markdown, table, write_between
+from trainers.common.errors import UserError
 
-RUN_FILE = ROOT / "config" / "run.yaml"
+RUN_FILES = ROOT / "config"
 CHANGES_FILE = Path(__file__).with_suffix(".yaml")
 HEAD = ("change", "first action", "position (mm)", "yaw (deg)")
 
@@ -44,20 +45,45 @@ class Change:
     overrides: Sequence[str]
 
 
-def load_changes() -> dict[str, Change]:
-    """The changes by their slugs, in the order of the table."""
-    entries = yaml.safe_load(CHANGES_FILE.read_text())
-    return {slug: Change(slug, **entry) for slug, entry in entries.items()}
+@dataclass(frozen=True)
+class Recipe:
+    """A run file, and what is changed in it.
+
+    Attributes:
+        name: of the run file, without its ending.
+        evaluated: overrides of all evaluations.
+        changes: by their slugs, in the order of the table.
+    """
+
+    name: str
+    evaluated: Sequence[str]
+    changes: Mapping[str, Change]
+
+    @property
+    def run_file(self) -> Path:
+        """Where it is."""
+        return RUN_FILES / f"{self.name}.yaml"
+
+
+def load_recipes() -> dict[str, Recipe]:
+    """The recipes by their names."""
+    return {
+        name: Recipe(
+            name,
+            entry["evaluated"],
+            {slug: Change(slug, **change) for slug, change in entry["changes"].items()},
+        )
+        for name, entry in yaml.safe_load(CHANGES_FILE.read_text()).items()
+    }
 
 
 @tells_mistakes
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains and evaluates what is missing, and reports on all."""
-    known = load_changes()
-    options = parse(arguments, list(known))
-    changes = [change for slug, change in known.items() if slug in options.changes]
+    options = parse(arguments)
+    recipe, changes = options.recipe, options.changes
     jobs = {
-        (change.slug, seed): job_of(change, seed, options.steps, options.results)
+        (change.slug, seed): job_of(recipe, change, seed, options.steps, options.results)
         for seed in options.seeds
         for change in changes
     }
@@ -67,34 +93,48 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows = [
         row(change, [reports[change.slug, seed] for seed in options.seeds]) for change in changes
     ]
-    title = f"{options.steps:,} steps, {len(options.seeds)} seeds"
+    title = f"{recipe.name}: {options.steps:,} steps, {len(options.seeds)} seeds"
     Console().print(table(title, HEAD, rows))
     if options.page is not None:
-        write_between(options.page, "ablation", markdown(HEAD, rows))
+        write_between(options.page, f"ablation {recipe.name}", markdown(HEAD, rows))
     return 0
 
 
-def parse(arguments: Sequence[str] | None, slugs: Sequence[str]) -> argparse.Namespace:
-    """Reads the command line."""
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Reads the command line; `recipe` and `changes` are what is named.
+
+    Raises:
+        UserError: the recipe has no such change.
+    """
+    recipes = load_recipes()
     parser = argparse.ArgumentParser(prog="python -m benchmarks.ablation", description=__doc__)
-    parser.add_argument("--changes", nargs="+", choices=slugs, default=slugs)
+    parser.add_argument("recipe", nargs="?", choices=recipes, default="run", help="a run file")
+    parser.add_argument("--changes", nargs="+", metavar="NAME", help="default: all there are")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--steps", type=int, default=300_000, help="of each run")
     add_options(parser, "results/ablation")
-    return parser.parse_args(arguments)
+    options = parser.parse_intermixed_args(arguments)
+    options.recipe = recipe = recipes[options.recipe]
+    slugs = options.changes or list(recipe.changes)
+    for slug in slugs:
+        if slug not in recipe.changes:
+            raise UserError(f"--changes: no {slug!r} in {', '.join(recipe.changes)}")
+    options.changes = [recipe.changes[slug] for slug in recipe.changes if slug in slugs]
+    return options
 
 
-def job_of(change: Change, seed: int, steps: int, results: Path) -> Job:
+def job_of(recipe: Recipe, change: Change, seed: int, steps: int, results: Path) -> Job:
     """Training from scratch with a change, then the evaluation."""
-    name, folder = f"{change.slug}-{steps}-{seed}", results.resolve()
+    name, folder = f"{recipe.name}-{change.slug}-{steps}-{seed}", results.resolve()
     file = folder / f"{name}.json"
-    learn = ["-m", "trainers.learn", str(RUN_FILE), *change.overrides]
+    learn = ["-m", "trainers.learn", str(recipe.run_file), *change.overrides]
     # One checkpoint, the last: the best of several would be of another step in every row.
     learn += [f"trainer.max_steps={steps}", f"trainer.checkpoint_interval={steps}"]
     learn += ["--seed", str(seed), "--run-id", name]
     # What an interrupted run left has no results; it begins anew.
     learn += ["--results-dir", str(folder / "runs"), "--force"]
-    evaluate = ["-m", "trainers.evaluate", str(folder / "runs" / name), "--json", str(file)]
+    evaluate = ["-m", "trainers.evaluate", str(folder / "runs" / name), *recipe.evaluated]
+    evaluate += ["--json", str(file)]
     return Job(name, (learn, evaluate), file)
 
 
