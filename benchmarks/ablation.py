@@ -20,10 +20,11 @@ from typing import Any
 import yaml
 from rich.console import Console
 
-from benchmarks.command import tells_mistakes
-from benchmarks.runs import ROOT, Job, add_options, run_missing
-from benchmarks.tables import markdown, table, write_between
+from benchmarks.command import ROOT, add_options, tells_mistakes
+from benchmarks.tables import table, write_between
 from trainers.common.errors import UserError
+from trainers.comparison.jobs import Job, run_missing
+from trainers.comparison.tables import markdown
 
 RUN_FILES = ROOT / "config"
 CHANGES_FILE = Path(__file__).with_suffix(".yaml")
@@ -135,7 +136,7 @@ def job_of(recipe: Recipe, change: Change, seed: int, steps: int, results: Path)
     learn += ["--results-dir", str(folder / "runs"), "--force"]
     evaluate = ["-m", "trainers.evaluate", str(folder / "runs" / name), *recipe.evaluated]
     evaluate += ["--json", str(file)]
-    return Job(name, (learn, evaluate), file)
+    return Job(name, (learn, evaluate), file, folder=ROOT)
 
 
 def row(change: Change, reports: Sequence[dict[str, Any]]) -> list[str]:

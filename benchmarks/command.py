@@ -1,16 +1,20 @@
-"""What the commands have in common: mistakes are told, and extras asked for, without tracebacks."""
+"""What the commands have in common: mistakes told, extras asked for, jobs and their results."""
 
 from __future__ import annotations
 
+import argparse
 import functools
 import importlib.util
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import ParamSpec
 
 from trainers.common.errors import UserError
+from trainers.comparison.jobs import CORES
 from trainers.learn import MISTAKE
 
+ROOT = Path(__file__).parents[1]
 INSTALL = "pip install -c constraints.txt -e '.[bench]'"
 P = ParamSpec("P")
 
@@ -44,3 +48,10 @@ def tells_mistakes(main: Callable[P, int]) -> Callable[P, int]:
             return MISTAKE
 
     return command
+
+
+def add_options(parser: argparse.ArgumentParser, results: str) -> None:
+    """Adds the options of a command that runs jobs and reports on them."""
+    parser.add_argument("--jobs", type=int, default=CORES, help="at a time")
+    parser.add_argument("--results", type=Path, default=Path(results), metavar="DIR")
+    parser.add_argument("--page", type=Path, metavar="FILE", help="write the table as Markdown")

@@ -19,9 +19,10 @@ import yaml
 from rich.console import Console
 
 from benchmarks.command import require, tells_mistakes
-from benchmarks.tables import markdown, table, write_between
+from benchmarks.tables import table, write_between
 from envs.grasp.settings import GraspSettings
 from trainers.common.errors import UserError
+from trainers.comparison.tables import markdown
 from trainers.evaluation import evaluate, find_run
 from trainers.reporting.figures import SURE, SURE_RIGHT
 from trainers.runfile.settings import RunSettings

@@ -22,11 +22,6 @@ def table(title: str, head: Sequence[str], rows: Rows, caption: str = "", left: 
     return made
 
 
-def markdown(head: Sequence[str], rows: Rows) -> list[str]:
-    """The lines of a Markdown table."""
-    return ["| " + " | ".join(row) + " |" for row in [head, ["---"] * len(head), *rows]]
-
-
 def write_between(path: Path, name: str, lines: Sequence[str]) -> None:
     """Writes lines between `<!-- name -->` and `<!-- end of name -->`, in place of what is there.
 

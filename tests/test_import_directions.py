@@ -26,6 +26,12 @@ ROOMS = {
         "trainers.common",
     },
     "trainers.reporting": {"trainers.experience", "trainers.networks", "trainers.common"},
+    "trainers.comparison": {
+        "trainers.reporting",
+        "trainers.saving",
+        "trainers.runfile",
+        "trainers.common",
+    },
 }
 """Rooms of `trainers`, and those below each; its own files are the spine, above all of them."""
 BELOW = {

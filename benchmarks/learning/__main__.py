@@ -15,12 +15,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.command import require, tells_mistakes
+from benchmarks.command import ROOT, add_options, require, tells_mistakes
 from benchmarks.learning.cases import CASES, PLUGINS, SIDES, Entry
 from benchmarks.learning.report import HEAD, draw, rows
-from benchmarks.runs import Job, add_options, run_missing
-from benchmarks.tables import markdown, table, write_between
+from benchmarks.tables import table, write_between
 from trainers.common.errors import UserError
+from trainers.comparison.jobs import Job, run_missing
+from trainers.comparison.tables import markdown
 from trainers.runfile.registry import load_registries
 
 
@@ -91,7 +92,7 @@ def _job(entry: Entry, results: Path) -> Job:
     """One run of one side, in a process of its own."""
     case, file = entry.case, results.resolve() / f"{entry.name}.json"
     command = ["-m", "benchmarks.learning.run", case.algorithm, case.task, str(case.steps)]
-    return Job(entry.name, [[*command, entry.side, str(entry.seed), str(file)]], file)
+    return Job(entry.name, [[*command, entry.side, str(entry.seed), str(file)]], file, folder=ROOT)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.runs import ROOT
+from benchmarks.command import ROOT
 
 RUN_FILES = ROOT / "config" / "gymnasium"
 PLUGINS = {"sac": Path("examples/ventosa-sac-plugin")}

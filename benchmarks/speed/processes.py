@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.runs import ROOT
+from benchmarks.command import ROOT
 
 RUN_FILE = ROOT / "config" / "run.yaml"
 BUFFERS = 2

@@ -15,7 +15,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field
 
-from benchmarks.runs import ROOT
+from benchmarks.command import ROOT
 from benchmarks.speed.figures import FRAME_GRAB, RIVALS, Figures, speedup
 from benchmarks.speed.simulation import frames, steps
 from benchmarks.speed.training import contenders, training

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.tables import markdown, write_between
+from benchmarks.tables import write_between
 from trainers.common.errors import UserError
+from trainers.comparison.tables import markdown
 
 
 def test_a_table_by_hand() -> None:

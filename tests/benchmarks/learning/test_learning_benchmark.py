@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict
 
+from benchmarks.command import ROOT
 from benchmarks.learning.cases import CASES, PEER_NAMES, PLUGINS, RUN_FILES, Case, Entry
 from benchmarks.learning.evaluation import Referee, returns
-from benchmarks.runs import ROOT
 from envs.environment import Environment
 from trainers.networks.network import NetworkSettings
 from trainers.runfile.settings import Component

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -11,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+CORES = len(os.sched_getaffinity(0))
 
 
 @dataclass(frozen=True)
@@ -20,28 +19,30 @@ class Job:
 
     Attributes:
         name: for people.
-        commands: arguments of Python's interpreter, from the project's root.
-        results: what the last command writes. Where it is, the job is done.
+        commands: arguments of Python's interpreter.
+        results: what the last command writes.
+        done: there is nothing to do; None: where the results are.
+        folder: where the commands run; None: here.
     """
 
     name: str
     commands: Sequence[Sequence[str]]
     results: Path
+    done: bool | None = None
+    folder: Path | None = None
 
-
-def add_options(parser: argparse.ArgumentParser, results: str) -> None:
-    """Adds the options of a command that runs jobs and reports on them."""
-    parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), help="at a time")
-    parser.add_argument("--results", type=Path, default=Path(results), metavar="DIR")
-    parser.add_argument("--page", type=Path, metavar="FILE", help="write the table as Markdown")
+    @property
+    def missing(self) -> bool:
+        """Whether there is anything to do."""
+        return not (self.results.exists() if self.done is None else self.done)
 
 
 def run_missing(jobs: Sequence[Job], at_once: int) -> int:
-    """Does the jobs that have no results yet; returns the highest exit code.
+    """Does the jobs that are missing, whatever becomes of others; returns the highest exit code.
 
     Each has one thread: small networks gain little from a second, and jobs go side by side.
     """
-    missing = [job for job in jobs if not job.results.exists()]
+    missing = [job for job in jobs if job.missing]
     with ThreadPoolExecutor(at_once) as pool:
         return max(pool.map(_run, missing), default=0)
 
@@ -53,7 +54,7 @@ def _run(job: Job) -> int:
     for command in job.commands:
         done = subprocess.run(
             [sys.executable, *command],
-            cwd=ROOT,
+            cwd=job.folder,
             env=environment,
             check=False,
             stdout=subprocess.DEVNULL,

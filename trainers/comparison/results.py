@@ -1,0 +1,108 @@
+"""What a run left in its folder: status, held-out evaluation and curves."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trainers.common.errors import UserError
+from trainers.runfile.yaml_document import read
+from trainers.saving.run_folder import CONFIGURATION
+
+STATUS = "status.json"
+REWARD, SPEED = "Environment/Cumulative Reward", "Performance/Steps Per Second"
+Curve = tuple[NDArray[np.int64], NDArray[np.float64]]
+"""Steps (k,) that rise, and values (k,)."""
+NOTHING: Curve = (np.empty(0, np.int64), np.empty(0))
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """One run, finished or not.
+
+    Attributes:
+        folder: the run's.
+        configuration: its resolved run file.
+        status: what `status.json` says; empty where there is none.
+        curves: by TensorBoard's tags.
+    """
+
+    folder: Path
+    configuration: Mapping[str, Any]
+    status: Mapping[str, Any] = field(default_factory=dict)
+    curves: Mapping[str, Curve] = field(default_factory=dict)
+
+    @property
+    def seed(self) -> int:
+        """Of the run."""
+        return int(self.configuration.get("seed", 0))
+
+    @property
+    def step(self) -> int:
+        """How far it came."""
+        return int(self.status.get("step", 0))
+
+    @property
+    def evaluation(self) -> Mapping[str, Any]:
+        """The last held-out evaluation; empty where there was none."""
+        return self.status.get("evaluation") or {}
+
+    @property
+    def reward(self) -> Curve:
+        """The mean cumulative reward of episodes."""
+        return self.curves.get(REWARD, NOTHING)
+
+    @property
+    def seconds(self) -> float:
+        """What all steps took, pauses between them left out."""
+        steps, rates = self.curves.get(SPEED, NOTHING)
+        return float(np.sum(np.diff(steps, prepend=0) / np.maximum(rates, 1e-9)))
+
+
+def read_run(folder: Path) -> RunResult:
+    """Reads a run's folder, wherever it was made and however far it came.
+
+    Raises:
+        UserError: it is no run's folder, or its files are not what a run writes.
+    """
+    if not (folder / CONFIGURATION).is_file():
+        raise UserError(f"{folder}: this is no run: it has no {CONFIGURATION}")
+    return RunResult(folder, read(folder / CONFIGURATION).data, _status(folder), _curves(folder))
+
+
+def _status(folder: Path) -> dict[str, Any]:
+    path = folder / STATUS
+    if not path.is_file():
+        return {}
+    try:
+        status = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: can't be read: {error}") from error
+    if not isinstance(status, dict):
+        raise UserError(f"{path}: should be an object, with `state` and `step`")
+    return status
+
+
+def _curves(folder: Path) -> dict[str, Curve]:
+    """Curves of all scalars; what an event file that was cut short still has."""
+    # Imported late: it takes seconds.
+    from tensorboard.backend.event_processing.event_accumulator import (  # noqa: PLC0415
+        EventAccumulator,
+    )
+
+    logging.getLogger("tensorboard").setLevel(logging.ERROR)
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
+    curves: dict[str, Curve] = {}
+    for tag in events.Tags()["scalars"]:
+        points = {event.step: event.value for event in events.Scalars(tag)}
+        steps = sorted(points)
+        values = np.array([points[step] for step in steps], np.float64)
+        curves[tag] = np.array(steps, np.int64), values
+    return curves
