@@ -83,7 +83,9 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
                 if held_out.begins_due and (resumed is None or resumed.score is None):
                     held_out.log(log)
                 summary.note_evaluation(held_out.latest)
-            training = Training(session, settings, log, summary, checkpoints, display, held_out)
+            training = Training(
+                session, settings, log, summary, checkpoints, display, held_out, resumed
+            )
             return _train(training, session, summary, checkpoints, display).finished
 
 

@@ -16,11 +16,13 @@ from trainers.held_out import HeldOutEvaluation
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.summary import Summary
 from trainers.reporting.terminal import TerminalDisplay
-from trainers.saving.checkpoint import Checkpoints
+from trainers.saving.checkpoint import Checkpoints, Loaded
 from trainers.session import Session
 
 REWARD, AGE = "reward", "age"
 """Kinds of scores where there are no evaluations; by age means that the newest counts."""
+SCORING = "since_checkpoint"
+"""Part of the saved state: the episodes that the next checkpoint's reward is the mean of."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,7 @@ class Training:
         checkpoints: where the run is saved.
         display: the terminal.
         held_out: evaluates while it learns, if anything does.
+        resumed: the checkpoint that the session was taken up from, if it was.
     """
 
     def __init__(
@@ -58,11 +61,18 @@ class Training:
         checkpoints: Checkpoints,
         display: TerminalDisplay,
         held_out: HeldOutEvaluation | None = None,
+        resumed: Loaded | None = None,
     ):
         self._session, self._settings, self._held_out = session, settings, held_out
         self._log, self._summary, self._display = log, summary, display
         self._checkpoints = checkpoints
         self._since_save = Averager()
+        self._saved_step: int | None = None
+        self._saved_score: float | None = None
+        if resumed is not None:
+            self._saved_step, self._saved_score = resumed.step, resumed.score
+            if SCORING in resumed.state:  # not in those of former versions
+                self._since_save.load_state_dict(resumed.state[SCORING])
 
     def run(self) -> Ending:
         """Trains until there is reason to end; what was learned is saved.
@@ -78,7 +88,9 @@ class Training:
 
     def _run(self) -> Ending:
         env_runner, max_steps = self._session.env_runner, self._settings.max_steps
-        saved_at = env_runner.step_count
+        interval = self._settings.checkpoint_interval
+        if self._saved_step is not None:
+            self._save(env_runner.step_count)  # its evaluation was cut off, and is made up for
         while env_runner.step_count < max_steps:
             step = env_runner.step_count
             # Between an update and the next collection is where a run can be taken up again. It may
@@ -86,16 +98,14 @@ class Training:
             with self._saved_if_cut_off(step, self._session.state_dict()), timed("collect"):
                 self._session.algorithm.collect()
             self._update(step / max_steps)
-            step = env_runner.step_count
+            before, step = step, env_runner.step_count
             with self._saved_if_cut_off(step):
                 evaluated = self._evaluate(step)
-            if evaluated or step - saved_at >= self._settings.checkpoint_interval:
-                saved_at = step
-                self._save(step)
+            if evaluated or step // interval > before // interval:
+                self._save(step, interval_over=True)
             if evaluated and self._held_out and (reached := self._held_out.target_reached):
                 return Ending(True, reached)
-        if saved_at < env_runner.step_count:
-            self._save(env_runner.step_count)
+        self._save(env_runner.step_count)
         return Ending(True, f"max_steps: {max_steps} steps were taken")
 
     @contextmanager
@@ -137,23 +147,32 @@ class Training:
         self._summary.note_evaluation(held_out.latest)
         return True
 
-    def _save(self, step: int, state: dict[str, Any] | None = None) -> None:
+    def _save(
+        self, step: int, state: dict[str, Any] | None = None, *, interval_over: bool = False
+    ) -> None:
+        """Saves the run, unless it is saved already with all that is known of it."""
+        score, score_of = self._score(step)
+        if step == self._saved_step and (score is None or self._saved_score is not None):
+            return
+        if interval_over:
+            self._since_save = Averager()
         with timed("checkpoint"):
-            state = {"step": step, **(state or self._session.state_dict())}
-            score, score_of = self._score(step)
+            scoring = self._since_save.state_dict()
+            state = {"step": step, SCORING: scoring, **(state or self._session.state_dict())}
             weights = self._session.weights()
             path = self._checkpoints.save(step, weights, state, score, score_of)
+        self._saved_step, self._saved_score = step, score
         self._summary.note_checkpoint(path)
 
     def _score(self, step: int) -> tuple[float | None, str]:
         """Score that the best checkpoint is chosen by, if it has one, and what it is a score of.
 
         By an evaluation of this very policy where there are evaluations. By the mean reward since
-        the last checkpoint otherwise; but those of different lessons can't be compared.
+        the last interval's checkpoint otherwise; but those of different lessons can't be compared.
         """
         if self._held_out is not None:
             is_of_this = self._held_out.latest["step"] == step
             score_of = f"evaluation.{self._held_out.scored_by}"
             return self._held_out.score if is_of_this else None, score_of
-        reward = self._since_save.pop_means().get(REWARD)
+        reward = self._since_save.means().get(REWARD)
         return (reward, REWARD) if self._session.lesson_count == 1 else (None, AGE)

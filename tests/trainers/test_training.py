@@ -77,6 +77,7 @@ class Training:
         self.settings: Any = run.trainer.settings
         self.checkpoints = Checkpoints(folder, keep=99)
         self.quiet = Quiet()
+        self.resumed: Loaded | None = None
         self.session.reset()
 
     @property
@@ -88,16 +89,16 @@ class Training:
         return [entry.step for entry in self.checkpoints.list_checkpoints()]
 
     def resume(self) -> Loaded:
-        loaded = self.checkpoints.load_latest()
-        self.session.load_state_dict(loaded.weights, loaded.state)
-        return loaded
+        self.resumed = self.checkpoints.load_latest()
+        self.session.load_state_dict(self.resumed.weights, self.resumed.state)
+        return self.resumed
 
     def train(self, held_out: Any = None) -> bool:
         quiet: Any = self.quiet
         env, settings = self.session.env_runner.env, self.settings
         summary = Summary(quiet, "run", env, settings.max_steps, settings.summary_freq)
         loop = training_module.Training(
-            self.session, settings, quiet, summary, self.checkpoints, quiet, held_out
+            self.session, settings, quiet, summary, self.checkpoints, quiet, held_out, self.resumed
         )
         self.ending = loop.run()
         return self.ending.finished
@@ -370,6 +371,69 @@ def test_without_evaluations_the_reward_since_the_last_checkpoint_is_the_score(
     lessons = training(curriculum=LESSONS, folder="lessons")
     lessons.train()
     assert set(kinds(lessons).values()) == {(None, "age")}
+
+
+def contents(one: Training) -> dict[str, bytes]:
+    folder = one.checkpoints.directory
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("stop_at_step", [0, 48, 52, 64])
+def test_a_run_taken_up_and_stopped_at_once_leaves_its_checkpoints_as_they_are(
+    training: Callable[..., Training], stop_at_step: int
+) -> None:
+    trainer = {"checkpoint_interval": 32}
+    training(trainer, stop_at_step=stop_at_step).train()
+    before, again = contents(training()), training(trainer, stop_at_step=0)
+    again.resume()
+    again.train()
+    assert contents(again) == before
+
+
+def test_a_stop_right_after_a_checkpoint_saves_nothing_twice(
+    training: Callable[..., Training], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, saved = training({"checkpoint_interval": 32}, stop_at_step=36), []
+    save = one.checkpoints.save
+
+    def noted(step: int, *rest: Any) -> Path:
+        saved.append(step)
+        return save(step, *rest)
+
+    monkeypatch.setattr(one.checkpoints, "save", noted)
+    one.train()
+    assert saved == [32]
+    assert kinds(one)[32][0] is not None
+
+
+@pytest.mark.parametrize("stop_at_step", [20, 36, 52, 68])
+def test_scores_and_intervals_are_those_of_a_run_that_was_not_stopped(
+    training: Callable[..., Training], stop_at_step: int
+) -> None:
+    constant = {"learning_rate_schedule": "constant", "beta_schedule": "constant"}
+    trainer = {"max_steps": 96, "checkpoint_interval": 32, "hyperparameters": constant}
+    whole = training(trainer, folder="whole")
+    whole.train()
+    training(trainer, stop_at_step=stop_at_step).train()
+    again = training(trainer)
+    again.resume()
+    again.train()
+    scores = kinds(again)
+    if stop_at_step % 32 > 16:
+        scores.pop(stop_at_step // 16 * 16)  # saved because of the stop
+    assert scores == kinds(whole)
+    assert list(scores) == [32, 64, 96]
+
+
+def test_an_evaluation_that_was_cut_off_scores_its_checkpoint_when_it_is_made_up_for(
+    training: Callable[..., Training],
+) -> None:
+    training({"checkpoint_interval": 1000}).train(HeldOut(StopRequested()))
+    again, made_up_for = training(stop_at_step=0), HeldOut()
+    made_up_for.latest = {"step": again.resume().step}
+    again.train(made_up_for)
+    assert kinds(again) == {32: (0.5, "evaluation.success")}
+    assert again.checkpoints.load_latest().state["interaction"]["step_count"] == 32
 
 
 def test_a_breakdown_while_updating_saves_nothing(

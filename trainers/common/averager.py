@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 
 class Averager:
@@ -20,8 +21,20 @@ class Averager:
             self._sums[name] = self._sums.get(name, 0.0) + float(value) * count
             self._counts[name] = self._counts.get(name, 0) + count
 
+    def means(self) -> dict[str, float]:
+        """The mean of each name that got a value."""
+        return {name: total / self._counts[name] for name, total in self._sums.items()}
+
     def pop_means(self) -> dict[str, float]:
         """The mean of each name that got a value; then start anew."""
-        means = {name: total / self._counts[name] for name, total in self._sums.items()}
+        means = self.means()
         self._sums, self._counts = {}, {}
         return means
+
+    def state_dict(self) -> dict[str, Any]:
+        """What was added, to go on from."""
+        return {"sums": dict(self._sums), "counts": dict(self._counts)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go back to a state."""
+        self._sums, self._counts = dict(state["sums"]), dict(state["counts"])

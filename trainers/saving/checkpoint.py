@@ -143,8 +143,9 @@ class Checkpoints:
     ) -> Path:
         """Save a checkpoint, mark it, and remove those no longer needed.
 
-        A checkpoint of the same step is replaced. A crash at any moment leaves at least the
-        checkpoints that were there before.
+        A checkpoint of the same step is replaced; its score stays if its weights are the same and
+        there is no new one. A crash at any moment leaves at least the checkpoints that were there
+        before.
 
         Args:
             step: environment steps taken.
@@ -179,6 +180,11 @@ class Checkpoints:
                 raise
             self._mark_and_prune()
         return path
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is no checkpoint, not even a damaged one."""
+        return not self._entries()
 
     def list_checkpoints(self) -> list[CheckpointInfo]:
         """Checkpoints with a readable manifest, in the order in which they were saved.
@@ -284,18 +290,19 @@ class Checkpoints:
     def _write_manifest(self, folder: Path, step: int, score: float | None, score_of: str) -> None:
         """Describe the folder's files in its manifest and put everything on the disk."""
         serials = [entry.serial for entry in self._entries() if entry.serial is not None]
+        files = {
+            name: _FileRecord(size=(folder / name).stat().st_size, sha256=_digest(folder / name))
+            for name in (WEIGHTS, STATE_ARRAYS, STATE)
+        }
+        if score is None or not math.isfinite(score):
+            score = _known_score(self.directory / f"step-{step}", files[WEIGHTS], score_of)
         manifest = _Manifest(
             format=FORMAT,
             step=step,
             serial=max(serials, default=0) + 1,
-            score=None if score is None or not math.isfinite(score) else float(score),
+            score=None if score is None else float(score),
             score_of=score_of,
-            files={
-                name: _FileRecord(
-                    size=(folder / name).stat().st_size, sha256=_digest(folder / name)
-                )
-                for name in (WEIGHTS, STATE_ARRAYS, STATE)
-            },
+            files=files,
         )
         (folder / MANIFEST).write_text(manifest.model_dump_json(indent=2))
         for file in folder.iterdir():
@@ -392,6 +399,16 @@ def _info(step: int, path: Path) -> CheckpointInfo:
     except _DamageError:
         return CheckpointInfo(step, path, score=None, score_of="", serial=None)
     return CheckpointInfo(step, path, manifest.score, manifest.score_of, manifest.serial)
+
+
+def _known_score(path: Path, weights: _FileRecord, score_of: str) -> float | None:
+    """Score of the checkpoint at a path if it is of these very weights, and of the same kind."""
+    try:
+        manifest = _read_manifest(path)
+    except _DamageError:
+        return None
+    same = manifest.files.get(WEIGHTS) == weights and manifest.score_of == score_of
+    return manifest.score if same else None
 
 
 def _has_right_sizes(path: Path) -> bool:

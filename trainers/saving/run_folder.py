@@ -85,7 +85,7 @@ def _blaming_the_results_dir(directory: Path) -> Iterator[None]:
 
 def has_checkpoints(directory: Path) -> bool:
     """Whether a run's folder has any checkpoint."""
-    return any((directory / CHECKPOINTS).glob("step-*"))
+    return not Checkpoints(directory / CHECKPOINTS, keep=1).empty
 
 
 def find_checkpoint(name: str, results_dir: Path) -> Loaded:

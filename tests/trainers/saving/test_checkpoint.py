@@ -259,6 +259,24 @@ def test_the_same_step_is_replaced(tmp_path: Path) -> None:
     assert (loaded.state, loaded.weights["w"].item(), loaded.score) == ({"try": 2}, 1.0, 0.1)
 
 
+def test_a_score_is_not_lost_where_the_same_weights_are_saved_again_without_one(
+    tmp_path: Path,
+) -> None:
+    checkpoints = Checkpoints(tmp_path, keep=1)
+    save(checkpoints, 100, 0.9)
+    save(checkpoints, 200, 0.5)
+    save(checkpoints, 200)
+    assert checkpoints.load_latest().score == 0.5
+    assert marked(tmp_path, "best") == "step-100"
+    save(checkpoints, 200, 0.6)
+    assert checkpoints.load_latest().score == 0.6
+    save(checkpoints, 200, None, "evaluation.success")  # another kind of score
+    assert checkpoints.load_latest().score is None
+    save(checkpoints, 300, 0.7)
+    checkpoints.save(300, {"w": torch.zeros(1)}, {}, None, "reward")  # another policy
+    assert checkpoints.load_latest().score is None
+
+
 def test_after_going_back_the_latest_is_the_one_saved_last(tmp_path: Path) -> None:
     checkpoints = Checkpoints(tmp_path, keep=2)
     for step in (100, 200, 300):
@@ -296,7 +314,9 @@ def test_leftovers_of_interrupted_saves_are_ignored_then_removed(tmp_path: Path)
 
 def test_one_put_aside_for_a_replacement_that_never_came_still_counts(tmp_path: Path) -> None:
     checkpoints = Checkpoints(tmp_path, keep=2)
+    assert checkpoints.empty
     save(checkpoints, 100).rename(tmp_path / ".step-100.old-0a1b2c3d")
+    assert not checkpoints.empty
     assert checkpoints.load_latest().step == 100
     save(checkpoints, 200)
     assert steps(checkpoints) == [100, 200]

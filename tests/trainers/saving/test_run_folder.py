@@ -71,6 +71,14 @@ def test_a_taken_folder_names_the_ways_out(tmp_path: Path) -> None:
     check(tmp_path, resume=True, force=False)
 
 
+def test_an_only_checkpoint_between_two_renames_can_be_resumed_as_it_can_be_evaluated(
+    tmp_path: Path,
+) -> None:
+    save(tmp_path, 100).rename(tmp_path / "checkpoints/.step-100.old-0a1b2c3d")
+    check(tmp_path, resume=True, force=False)
+    assert find_checkpoint(str(tmp_path), tmp_path).step == 100
+
+
 def test_a_folder_that_can_not_be_made_is_the_users_mistake(
     tmp_path: Path, make_run: Callable[..., RunSettings]
 ) -> None:
