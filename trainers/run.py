@@ -26,8 +26,9 @@ from trainers.saving.run_folder import (
     CHECKPOINTS,
     CONFIGURATION,
     begin,
-    check,
+    claim,
     find_checkpoint,
+    run_name,
 )
 from trainers.session import Session
 from trainers.training import Ending, Training
@@ -53,11 +54,12 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
     run = load_run(options.config, options.overrides + _flags(options), registries)
     settings = run.trainer.settings
     assert isinstance(settings, TrainerSettings)  # the registry sees to it
-    run_id = options.run_id or options.config.stem
+    run_id = run_name(options.config.stem if options.run_id is None else options.run_id)
     directory = options.results_dir / run_id
     checkpoints = Checkpoints(directory / CHECKPOINTS, settings.keep_checkpoints)
-    check(directory, resume=options.resume, force=options.force)
     with ExitStack() as stack:
+        lock = claim(directory, resume=options.resume, force=options.force)
+        stack.enter_context(closing(lock))
         session = stack.enter_context(closing(Session(run, registries, stop_requested)))
         # Nothing is replaced before it is certain that the run can begin.
         resumed = _start(session, options, checkpoints)

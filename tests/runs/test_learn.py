@@ -203,6 +203,11 @@ def test_flags_stand_for_keys_of_the_run_file(learn: Learn, write_run: WriteRun)
         (["environment_parameters={scael: 1}"], ["environment_parameters", "'scale'"]),
         (["--device", "cuda:99"], ["device", "'cuda:99'", "use 'cpu'"]),
         (["--resume"], ["no checkpoint to resume", "without --resume"]),
+        (
+            ["--run-id", "../results/one", "--force"],
+            ["'../results/one': a run's name is", "no path"],
+        ),
+        (["--run-id", ""], ["'': a run's name is", "not empty"]),
         (["--initialize-from", "ghost"], ["ghost: neither a run nor a checkpoint"]),
     ],
 )
@@ -289,8 +294,71 @@ def test_force_replaces_a_run_and_nothing_else(learn: Learn, write_run: WriteRun
     (results / "photos/holiday.txt").write_text("sea")
     refused = learn(config, "--run-id", "photos", "--force")
     assert refused.code == 2
-    assert "this is none" in refused.errors
+    assert "holiday.txt: no run wrote this" in refused.errors
+    (results / "toy/notes.txt").write_text("mine")
+    refused = learn(config, "--force")
+    assert refused.code == 2
+    assert f"{results / 'toy/notes.txt'}: no run wrote this" in refused.errors
+    assert latest(results, "toy").step == 16
     assert (results / "photos/holiday.txt").read_text() == "sea"
+
+
+def in_another_process(*arguments: Any) -> int:
+    """Forks the command line off, with the toys in its registries; the process's id."""
+    child = os.fork()
+    if child == 0:
+        try:
+            os._exit(main([*map(str, arguments)]))
+        finally:  # never back into pytest
+            os._exit(99)
+    return child
+
+
+def exit_code(process: int) -> int:
+    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+
+
+@pytest.mark.parametrize("option", ["--force", "--resume"])
+def test_a_run_that_goes_on_is_left_to_the_process_that_has_it(
+    learn: Learn, write_run: WriteRun, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    config, codes = write_run(), []
+    results = config.parent / "results"
+
+    def intrude() -> None:
+        intruder = in_another_process(config, option, "--results-dir", results)
+        codes.append(exit_code(intruder))
+
+    with monkeypatch.context() as patch:
+        call_at_env_step(patch, 11, intrude)  # after a checkpoint
+        done = learn(config)
+    assert codes == [2]
+    going_on = f"error: {results / 'toy'}: this run is going on: process {os.getpid()} on "
+    assert done.errors.startswith(going_on)
+    assert done.code == 0
+    assert done.step == 64
+    assert not (results / "toy/run.lock").exists()
+    assert learn(config, option, "trainer.max_steps=80").code == 0
+
+
+def test_of_three_starts_of_one_run_one_goes_on_and_nothing_is_mixed(
+    learn: Learn, write_run: WriteRun
+) -> None:
+    config = write_run()
+    results = config.parent / "results"
+    started = [
+        in_another_process(config, "--seed", seed, "--results-dir", results) for seed in (1, 2, 3)
+    ]
+    codes = [exit_code(process) for process in started]
+    assert sorted(codes) == [0, 2, 2]
+    seed = 1 + codes.index(0)
+    written = yaml.safe_load((results / "toy/configuration.yaml").read_text())
+    assert written["seed"] == seed
+    assert learn(config, "--seed", seed, "--run-id", "alone").code == 0
+    toy, alone = latest(results, "toy"), latest(results, "alone")
+    for name in ("weights.safetensors", "state.safetensors", "state.json"):
+        assert (toy.path / name).read_bytes() == (alone.path / name).read_bytes()
+    assert len(list((results / "toy").glob("events*"))) == 1
 
 
 # -- other weights to begin with -----------------------------------------------------------------

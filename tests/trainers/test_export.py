@@ -115,7 +115,7 @@ def test_runs_and_policies_do_not_replace_each_other(
     assert export(results, results / "mine") == DONE
     learned = learn(write_run("target"), "--run-id", "mine", "--force")
     assert learned.code == MISTAKE
-    assert "this is an exported policy" in learned.errors
+    assert f"{results / 'mine' / 'manifest.json'}: no run wrote this" in learned.errors
     assert (results / "mine" / "weights.safetensors").is_file()
 
 

@@ -43,6 +43,7 @@ MANIFEST = "manifest.json"
 
 _FOLDER = re.compile(r"step-(\d+)")
 _LEFTOVER = re.compile(r"\.step-(\d+)\.(tmp|old)-\w+")
+_MARKER = re.compile(r"(latest|best)\.json|\.(latest|best)\.json\.tmp")
 
 
 class CheckpointError(UserError):
@@ -326,6 +327,22 @@ class Checkpoints:
     def _mark(self, name: str, entry: CheckpointInfo) -> None:
         content = {"step": entry.step, "checkpoint": entry.path.name, "score": entry.score}
         write_atomically(self.directory / f"{name}.json", json.dumps(content))
+
+
+def own_names(directory: Path) -> set[str]:
+    """Names of what `Checkpoints` wrote into a directory: folders, markers, and what a crash left.
+
+    A folder is known by its name alone.
+    """
+    return {
+        path.name
+        for path in directory.iterdir()
+        if (
+            _FOLDER.fullmatch(path.name) or _LEFTOVER.fullmatch(path.name)
+            if path.is_dir() and not path.is_symlink()
+            else _MARKER.fullmatch(path.name)
+        )
+    }
 
 
 def weights_manifest(checkpoint: Loaded, weights: bytes) -> str:

@@ -32,7 +32,7 @@ class EvaluationFolder:
         self._folder, self._names = folder, tuple(names)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            own = _own_files(folder / REPORT)
+            own = own_names(folder)
             taken = [name for name in (REPORT, *self._names) if (folder / name).exists()]
             foreign = [name for name in taken if name not in own]
         except OSError as error:
@@ -58,9 +58,9 @@ class EvaluationFolder:
             raise UserError(f"--render: {error.filename}: {error.strerror}") from error
 
 
-def _own_files(report: Path) -> set[str]:
-    """The report and the files it lists; none if it is no evaluation's."""
+def own_names(folder: Path) -> set[str]:
+    """Names of an evaluation's report and of the files it lists; none if it is no evaluation's."""
     try:
-        return {REPORT, *json.loads(report.read_text())[FILES]}
+        return {REPORT, *json.loads((folder / REPORT).read_text())[FILES]}
     except (FileNotFoundError, ValueError, KeyError, TypeError):
         return set()

@@ -2,58 +2,90 @@
 
 from __future__ import annotations
 
+import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from trainers.common.errors import UserError
 from trainers.common.files import write_atomically
+from trainers.saving import checkpoint, evaluation_folder
 from trainers.saving.checkpoint import MANIFEST, Checkpoints, Loaded
+from trainers.saving.evaluation_folder import EVALUATION
+from trainers.saving.run_lock import LOCK, RunLock
 
 CONFIGURATION = "configuration.yaml"
 CHECKPOINTS = "checkpoints"
 
+_FILE = re.compile(
+    r"(configuration\.yaml|policy\.json|status\.json|timers\.json)"
+    r"|\.(configuration\.yaml|policy\.json|status\.json|timers\.json)\.tmp"
+    r"|events\.out\.tfevents\..+"
+)
+"""Names of a run's own files, as `trainers.run` and its log write them."""
+_FOLDERS = {CHECKPOINTS: checkpoint.own_names, EVALUATION: evaluation_folder.own_names}
+"""A run's folders, and what finds the names of its own in them."""
 
-def check(directory: Path, *, resume: bool, force: bool) -> None:
-    """Sees whether a run may have a folder; changes nothing.
+
+def run_name(name: str) -> str:
+    """A run's name, which is that of its folder in the results.
+
+    Raises:
+        UserError: it is none.
+    """
+    if not name or name.startswith(".") or not name.isprintable() or {"/", "\\"} & set(name):
+        raise UserError(
+            f"--run-id {name!r}: a run's name is that of a folder in --results-dir: not empty, no "
+            "path, and no dot at its beginning"
+        )
+    return name
+
+
+def claim(directory: Path, *, resume: bool, force: bool) -> RunLock:
+    """Makes a run's folder this process's own, before anything in it changes.
 
     Args:
         directory: the run's folder.
         resume: go on with the run that is there.
         force: replace the run that is there.
 
+    Returns:
+        The folder's lock, to be closed when the run ends.
+
     Raises:
-        UserError: the folder is taken, has nothing to resume, or can't be read.
+        UserError: the folder is taken, has nothing to resume, or can't be written.
     """
     with _blaming_the_results_dir(directory):
-        if resume:
-            if not has_checkpoints(directory):
-                raise UserError(
-                    f"{directory}: there is no checkpoint to resume; start the run without --resume"
-                )
-        elif directory.exists() and any(directory.iterdir()):
-            if not force:
-                raise UserError(
-                    f"{directory}: this run exists already: go on with it (--resume), replace it "
-                    "(--force), or choose another --run-id"
-                )
-            if not (directory / CONFIGURATION).is_file():
-                raise UserError(
-                    f"{directory}: --force deletes runs, and this is none (it has no "
-                    f"{CONFIGURATION}); choose another --run-id"
-                )
-            if (directory / MANIFEST).is_file():
-                raise UserError(
-                    f"{directory}: --force deletes runs, and this is an exported policy; choose "
-                    "another --run-id"
-                )
+        lock = RunLock(directory)
+        try:
+            _check(directory, resume, force)
+        except BaseException:
+            lock.close()
+            raise
+    return lock
+
+
+def _check(directory: Path, resume: bool, force: bool) -> None:
+    if resume:
+        if not has_checkpoints(directory):
+            raise UserError(
+                f"{directory}: there is no checkpoint to resume; start the run without --resume"
+            )
+        return
+    own, foreign = contents(directory)
+    if not force and (own or foreign):
+        raise UserError(
+            f"{directory}: this run exists already: go on with it (--resume), replace it "
+            "(--force), or choose another --run-id"
+        )
+    _refuse(foreign)
 
 
 def begin(directory: Path, files: Mapping[str, str], *, resume: bool) -> None:
     """Makes a run's folder ready, and writes into it what its policies are loaded by.
 
-    Comes after `check`, and as late as can be: what it replaces is gone.
+    Comes after `claim`, and as late as can be: what it replaces is gone.
 
     Args:
         directory: the run's folder.
@@ -61,14 +93,56 @@ def begin(directory: Path, files: Mapping[str, str], *, resume: bool) -> None:
         resume: keep what is there.
 
     Raises:
-        UserError: the folder can't be written.
+        UserError: the folder can't be written, or holds what no run wrote.
     """
     with _blaming_the_results_dir(directory):
-        if directory.exists() and not resume:
-            shutil.rmtree(directory)
         directory.mkdir(parents=True, exist_ok=True)
+        if not resume:
+            _remove_run(directory)
         for name, content in files.items():
             write_atomically(directory / name, content)
+
+
+def contents(directory: Path) -> tuple[list[Path], list[Path]]:
+    """What a run, and evaluations of it, wrote into its folder; and what is not theirs.
+
+    The lock is neither; folders come after what is in them, checkpoints whole.
+    """
+    own: list[Path] = []
+    foreign: list[Path] = []
+    for path in sorted(directory.iterdir()):
+        names_within = _FOLDERS.get(path.name)
+        if path.is_symlink():
+            foreign.append(path)
+        elif names_within is not None and path.is_dir():
+            names = names_within(path)
+            for inner in sorted(path.iterdir()):
+                (own if inner.name in names else foreign).append(inner)
+            own.append(path)
+        elif path.name != LOCK:
+            (own if _FILE.fullmatch(path.name) and path.is_file() else foreign).append(path)
+    return own, foreign
+
+
+def _remove_run(directory: Path) -> None:
+    """Removes what a run wrote, by its names: what is not its own stays whoever puts it there."""
+    own, foreign = contents(directory)
+    _refuse(foreign)
+    for path in own:
+        if not path.is_dir():
+            path.unlink()
+        elif path.parent == directory:
+            path.rmdir()
+        else:
+            shutil.rmtree(path)
+
+
+def _refuse(foreign: Sequence[Path]) -> None:
+    if foreign:
+        raise UserError(
+            f"{foreign[0]}: no run wrote this, and --force replaces nothing but a run: move it "
+            "away, or choose another --run-id"
+        )
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,15 +13,18 @@ from trainers.common.errors import UserError
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings, dump_yaml, load_run
 from trainers.saving.checkpoint import Checkpoints
+from trainers.saving.evaluation_folder import EvaluationFolder
 from trainers.saving.run_folder import (
     CONFIGURATION,
     begin,
-    check,
+    claim,
     find_checkpoint,
     find_run_folder,
     has_checkpoints,
     run_folder,
+    run_name,
 )
+from trainers.saving.run_lock import LOCK
 
 
 def save(folder: Path, step: int, score: float | None = None) -> Path:
@@ -39,43 +43,127 @@ def test_a_folder_begins_with_the_settings_that_reproduce_the_run(
 def test_beginning_afresh_replaces_and_resuming_keeps(
     tmp_path: Path,
 ) -> None:
-    files = {"a.txt": "first"}
+    files = {CONFIGURATION: "first"}
     begin(tmp_path / "run", files, resume=False)
     save(tmp_path / "run", 1)
-    begin(tmp_path / "run", {"a.txt": "second"}, resume=True)
-    assert (tmp_path / "run/a.txt").read_text() == "second"
+    begin(tmp_path / "run", {CONFIGURATION: "second"}, resume=True)
+    assert (tmp_path / "run" / CONFIGURATION).read_text() == "second"
     assert has_checkpoints(tmp_path / "run")
     begin(tmp_path / "run", files, resume=False)
     assert not has_checkpoints(tmp_path / "run")
 
 
+def names(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def claim_and_give_up(directory: Path, *, resume: bool = False, force: bool = False) -> None:
+    claim(directory, resume=resume, force=force).close()
+
+
 def test_a_free_folder_will_do(tmp_path: Path) -> None:
-    check(tmp_path / "new", resume=False, force=False)
+    claim_and_give_up(tmp_path / "new")
     (tmp_path / "empty").mkdir()
-    check(tmp_path / "empty", resume=False, force=False)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty"]
+    claim_and_give_up(tmp_path / "empty")
+    (tmp_path / "empty" / LOCK).touch()  # of a process that was killed
+    claim_and_give_up(tmp_path / "empty")
+    assert names(tmp_path) == ["empty"]
+
+
+def test_a_claimed_folder_says_by_whom(tmp_path: Path) -> None:
+    lock = claim(tmp_path / "run", resume=False, force=False)
+    assert f'"pid":{os.getpid()},' in (tmp_path / "run" / LOCK).read_text()
+    begin(tmp_path / "run", {"a.txt": "kept"}, resume=False)
+    lock.close()
+    assert names(tmp_path) == ["run", "run/a.txt"]
 
 
 def test_a_taken_folder_names_the_ways_out(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match=r"--resume.*--force.*--run-id"):
-        check(tmp_path, resume=False, force=False)
-    with pytest.raises(UserError, match=r"this is none \(it has no configuration\.yaml\)"):
-        check(tmp_path, resume=False, force=True)
+        claim_and_give_up(tmp_path)
+    with pytest.raises(UserError, match=r"notes\.txt: no run wrote this.*another --run-id"):
+        claim_and_give_up(tmp_path, force=True)
     with pytest.raises(UserError, match="no checkpoint to resume; start the run without --resume"):
-        check(tmp_path, resume=True, force=False)
-    assert (tmp_path / "notes.txt").read_text() == "mine"
-    (tmp_path / "configuration.yaml").touch()
-    check(tmp_path, resume=False, force=True)
+        claim_and_give_up(tmp_path, resume=True)
+    assert names(tmp_path) == ["notes.txt"]
+    (tmp_path / "notes.txt").rename(tmp_path / "configuration.yaml")
+    claim_and_give_up(tmp_path, force=True)
     save(tmp_path, 1)
-    check(tmp_path, resume=True, force=False)
+    claim_and_give_up(tmp_path, resume=True)
+
+
+def a_run(folder: Path) -> None:
+    """All that a run may leave, also one that was killed, and an evaluation of it."""
+    save(folder, 1, 1.0)
+    save(folder, 2, 2.0)
+    for name in (".step-3.tmp-0a1b2c3d", ".step-2.old-0a1b2c3d"):
+        (folder / "checkpoints" / name).mkdir()
+    files = ["configuration.yaml", "policy.json", "status.json", "timers.json"]
+    files += ["events.out.tfevents.1.host.2.0", ".status.json.tmp", "checkpoints/.best.json.tmp"]
+    for file in files:
+        (folder / file).touch()
+    EvaluationFolder(folder / "evaluation", ["a.png"]).write({}, [("a.png", b"")])
+
+
+def test_what_a_run_left_is_replaced_whole(tmp_path: Path) -> None:
+    a_run(tmp_path / "run")
+    lock = claim(tmp_path / "run", resume=False, force=True)
+    begin(tmp_path / "run", {"a.txt": "new"}, resume=False)
+    assert names(tmp_path / "run") == ["a.txt", LOCK]
+    lock.close()
+
+
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        "notes.txt",
+        "photos/holiday.jpg",
+        "checkpoints/step-best",
+        "checkpoints/notes.txt",
+        "evaluation/notes.txt",
+        "my-status.json",
+        "manifest.json",
+    ],
+)
+def test_what_no_run_wrote_keeps_a_folder_from_being_replaced(tmp_path: Path, foreign: str) -> None:
+    a_run(tmp_path)
+    (tmp_path / foreign).parent.mkdir(exist_ok=True)
+    (tmp_path / foreign).write_text("mine")
+    before = names(tmp_path)
+    said = rf"{tmp_path / foreign.split('/h', maxsplit=1)[0]}: no run wrote this"
+    with pytest.raises(UserError, match=said):
+        claim_and_give_up(tmp_path, force=True)
+    with pytest.raises(UserError, match=said):  # it may have come since
+        begin(tmp_path, {"a.txt": "new"}, resume=False)
+    assert names(tmp_path) == before
+
+
+def test_links_are_not_followed_when_a_run_is_replaced(tmp_path: Path) -> None:
+    a_run(tmp_path / "run")
+    (tmp_path / "run/checkpoints").rename(tmp_path / "elsewhere")
+    (tmp_path / "run/checkpoints").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="run/checkpoints: no run wrote this"):
+        claim_and_give_up(tmp_path / "run", force=True)
+    assert (tmp_path / "elsewhere/step-1/manifest.json").is_file()
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", ".hidden", "../one", "a/b", "/a", "a\\b", "a\nb"])
+def test_a_path_is_no_name(name: str) -> None:
+    with pytest.raises(UserError, match=r"--run-id .*: a run's name is that of a folder"):
+        run_name(name)
+
+
+@pytest.mark.parametrize("name", ["toy", "toy-2", "lr=3e-4, seed 1", "café", "v1..2"])
+def test_any_other_name_is(name: str) -> None:
+    assert run_name(name) == name
 
 
 def test_an_only_checkpoint_between_two_renames_can_be_resumed_as_it_can_be_evaluated(
     tmp_path: Path,
 ) -> None:
     save(tmp_path, 100).rename(tmp_path / "checkpoints/.step-100.old-0a1b2c3d")
-    check(tmp_path, resume=True, force=False)
+    claim_and_give_up(tmp_path, resume=True)
     assert find_checkpoint(str(tmp_path), tmp_path).step == 100
 
 
