@@ -19,7 +19,8 @@ from trainers.inference.metadata import FILE as METADATA
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.summary import Summary
 from trainers.reporting.terminal import TerminalDisplay, make_display
-from trainers.runfile.registry import load_registries
+from trainers.runfile.changes import changeable, changes
+from trainers.runfile.registry import Registries, load_registries
 from trainers.runfile.settings import RunSettings, dump_yaml, load_run
 from trainers.saving.checkpoint import Checkpoints, Loaded
 from trainers.saving.run_folder import (
@@ -60,14 +61,20 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
     with ExitStack() as stack:
         lock = claim(directory, resume=options.resume, force=options.force)
         stack.enter_context(closing(lock))
+        resumed = checkpoints.load_latest() if options.resume else None
+        if resumed is not None:
+            _check_unchanged(directory, run, registries)
         session = stack.enter_context(closing(Session(run, registries, stop_requested)))
         # Nothing is replaced before it is certain that the run can begin.
-        resumed = _start(session, options, checkpoints)
+        notes = _start(session, options, resumed)
         start = session.env_runner.step_count
         try:
             held_out = stack.enter_context(_held_out(session, run, start, stop_requested))
         except StopRequested:
             return False  # there is nothing to save yet that is not saved
+        if resumed is not None and (reason := _finished(resumed, settings, held_out)):
+            print(f"{run_id}: finished already, at step {start} ({reason}): raise that to go on")
+            return True
         files = {CONFIGURATION: dump_yaml(run), METADATA: session.metadata.to_json()}
         begin(directory, files, resume=options.resume)
         with (
@@ -76,7 +83,7 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
             _timers_written(directory),
         ):
             log.text("configuration", f"```yaml\n{dump_yaml(run)}```", start)
-            for note in resumed.notes if resumed else ():
+            for note in notes:
                 display.message(note)
             env = session.env_runner.env
             summary = Summary(log, run_id, env, settings.max_steps, settings.summary_freq, start)
@@ -151,36 +158,76 @@ def _last_good(checkpoints: Checkpoints) -> str:
     return f"the last good checkpoint is {saved[-1].path}"
 
 
-def _start(
-    session: Session, options: argparse.Namespace, checkpoints: Checkpoints
-) -> Loaded | None:
-    """Begins afresh, from other weights, or where the run stopped; returns what was resumed."""
-    if options.resume:
-        loaded = checkpoints.load_latest()
-        try:
-            session.load_state_dict(loaded.weights, loaded.state)
-        except EnvironmentFailure:
-            raise
-        except (RuntimeError, ValueError, KeyError) as error:
-            run = checkpoints.directory.parent
-            raise UserError(
-                f"{loaded.path}: the run can't go on from here: {first_lines(error, 2)}. --resume "
-                "needs the run file, and the version of ventosa, that the run began with; to begin "
-                f"another run with its weights, use --initialize-from {run}"
-            ) from error
-        return loaded
+def _check_unchanged(directory: Path, run: RunSettings, registries: Registries) -> None:
+    """Sees to it that a run that is taken up is the one that was begun.
+
+    Raises:
+        UserError: it is another; or its run file can't be read.
+    """
+    begun = load_run(directory / CONFIGURATION, [], registries)
+    if changed := changes(begun, run):
+        lines = "".join(f"\n  {line}" for line in changed)
+        raise UserError(
+            f"{directory}: the run was begun with other settings:{lines}\n--resume goes on with "
+            f"the run that was begun; only {', '.join(sorted(changeable(run)))} may change. To "
+            f"begin another run with its weights, use --initialize-from {directory}"
+        )
+
+
+def _finished(
+    resumed: Loaded, settings: TrainerSettings, held_out: HeldOutEvaluation | None
+) -> str | None:
+    """In words, why there is nothing left to do for a run that is taken up; None if there is."""
+    if held_out is not None and resumed.score is None:
+        return None  # its evaluation was cut off
+    if resumed.step >= settings.max_steps:
+        return f"trainer.max_steps: {settings.max_steps}"
+    return held_out.target_reached if held_out is not None and held_out.begins_due else None
+
+
+def _start(session: Session, options: argparse.Namespace, resumed: Loaded | None) -> list[str]:
+    """Begins afresh, from other weights, or where the run stopped; returns what is to be said."""
+    if resumed is not None:
+        _go_on(session, resumed)
+        return resumed.notes
+    notes: list[str] = []
     if options.initialize_from:
-        weights = find_checkpoint(options.initialize_from, options.results_dir).weights
+        given = find_checkpoint(options.initialize_from, options.results_dir)
         try:
-            session.algorithm.policy.load_state_dict(weights)
+            session.algorithm.policy.load_state_dict(given.weights)
         except RuntimeError as error:
             raise UserError(
                 f"--initialize-from {options.initialize_from}: these weights do not fit the run "
                 f"file's networks: {first_lines(error, 2)}. The {CONFIGURATION} that they "
                 "came with has the observations and the networks that they are for"
             ) from error
+        notes = [
+            *given.notes,
+            f"begins with all weights of {given.path}, and what the networks normalize "
+            "observations by; optimizers, steps, lesson, replay buffer and random numbers are new",
+        ]
     session.reset()
-    return None
+    return notes
+
+
+def _go_on(session: Session, resumed: Loaded) -> None:
+    """Takes a session to where the run stopped.
+
+    Raises:
+        UserError: the state does not fit it.
+        EnvironmentFailure: its environments broke down.
+    """
+    try:
+        session.load_state_dict(resumed.weights, resumed.state)
+    except EnvironmentFailure:
+        raise
+    except (RuntimeError, ValueError, KeyError) as error:
+        run = resumed.path.parents[1]
+        raise UserError(
+            f"{resumed.path}: the run can't go on from here: {first_lines(error, 2)}. --resume "
+            "needs the run file, and the version of ventosa, that the run began with; to begin "
+            f"another run with its weights, use --initialize-from {run}"
+        ) from error
 
 
 def _flags(options: argparse.Namespace) -> list[str]:

@@ -329,6 +329,8 @@ class GraspSettings(BaseModel, frozen=True, extra="forbid"):
         "pick.standoff_m": "standoff_m",
         "pick.standoff_s": "pick.approach_s",
     }
+    # What a run may go on with other values of.
+    changeable_keys: ClassVar[frozenset[str]] = frozenset({"workers"})
 
     simulator: Literal["pybullet", "fast"] = Field(
         "pybullet",

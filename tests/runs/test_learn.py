@@ -273,16 +273,63 @@ def test_a_run_is_neither_overwritten_nor_lost_by_mistake(
     # Each of these is a mistake found late, when the old run must still be there.
     assert learn(config, "--force", "--initialize-from", "ghost").code == 2
     assert learn(config, "--force", "trainer.network_settings.hidden_units=no").code == 2
-    misfit = learn(config, "--resume", "trainer.network_settings.hidden_units=9")
+    for change, said in [
+        ("trainer.network_settings.activation=tanh", "activation: 'relu' then, 'tanh' now"),
+        ("environment.num_envs=2", "environment.num_envs: 4 then, 2 now"),
+    ]:
+        misfit = learn(config, "--resume", change, "trainer.max_steps=80")
+        assert misfit.code == 2
+        assert "toy: the run was begun with other settings:\n  " in misfit.errors
+        assert said in misfit.errors
+        assert f"use --initialize-from {misfit.results / 'toy'}" in misfit.errors
+    assert {path: path.read_bytes() for path in kept} == kept
+
+
+def test_a_state_that_does_not_fit_names_the_way_out(learn: Learn, write_run: WriteRun) -> None:
+    config = write_run()
+    results = learn(config).results
+    written = results / "toy/configuration.yaml"  # as if another version had built other networks
+    wide = yaml.safe_load(written.read_text())
+    wide["trainer"]["network_settings"]["hidden_units"] = 9
+    written.write_text(yaml.safe_dump(wide))
+    misfit = learn(written, "--run-id", "toy", "--resume")
     assert misfit.code == 2
     assert "the run can't go on from here" in misfit.errors
     assert "needs the run file, and the version of ventosa" in misfit.errors
-    assert f"use --initialize-from {misfit.results / 'toy'}" in misfit.errors
-    for number in (2, 8):
-        misfit = learn(config, "--resume", "--num-envs", number)
-        assert misfit.code == 2
-        assert f"saved with 4 environments, not {number}" in misfit.errors
-    assert {path: path.read_bytes() for path in kept} == kept
+    assert f"use --initialize-from {results / 'toy'}" in misfit.errors
+
+
+def everything(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_finished_run_that_is_resumed_says_what_to_raise_and_stays_as_it_is(
+    learn: Learn, write_run: WriteRun
+) -> None:
+    config = write_run()
+    before = everything(learn(config).results)
+    again = learn(config, "--resume")
+    assert again.code == 0
+    assert again.output == (
+        "toy: finished already, at step 64 (trainer.max_steps: 64): raise that to go on\n"
+    )
+    assert everything(again.results) == before
+    assert learn(config, "--resume", "trainer.max_steps=80").step == 80
+
+
+def test_a_run_that_reached_its_target_is_finished_until_that_is_raised(
+    learn: Learn, write_run: WriteRun
+) -> None:
+    target = {"metric": "reward", "at_least": -1e9}
+    config = write_run(evaluation={"interval": 32, "episodes": 4, "stop_when": target})
+    before = everything(learn(config).results)
+    again = learn(config, "--resume")
+    assert again.code == 0
+    assert "toy: finished already, at step 32 (evaluation.stop_when: reward is" in again.output
+    assert everything(again.results) == before
+    raised = learn(config, "--resume", "evaluation.stop_when.at_least=1e9")
+    assert raised.code == 0
+    assert status(raised.results)["step"] == 64
 
 
 def test_force_replaces_a_run_and_nothing_else(learn: Learn, write_run: WriteRun) -> None:
@@ -378,6 +425,9 @@ def test_a_run_begins_with_the_weights_it_is_given(
     frozen = "trainer.hyperparameters.learning_rate=1e-30"
     done = learn(config, frozen, "--run-id", "second", "--initialize-from", name, "--seed", 9)
     assert done.code == 0
+    taken_over = f"begins with all weights of {results / 'first/checkpoints/step-'}"
+    assert taken_over in done.output
+    assert "optimizers, steps, lesson, replay buffer and random numbers are new" in done.output
     given, got = latest(results, "first"), latest(results, "second")
     assert got.step == 64  # its own count, from 0
     for key, tensor in given.weights.items():

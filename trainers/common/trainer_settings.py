@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from pydantic import BaseModel, Field
 
 
 class TrainerSettings(BaseModel, frozen=True, extra="forbid"):
     """Length of the training, and intervals of reports and checkpoints."""
+
+    # What a run may go on with other values of.
+    changeable_keys: ClassVar[frozenset[str]] = frozenset(
+        {"max_steps", "summary_freq", "checkpoint_interval", "keep_checkpoints"}
+    )
 
     max_steps: int = Field(
         500_000, ge=1, description="Steps of the whole run, over all environments."

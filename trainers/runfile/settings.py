@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pydantic import BaseModel, Field, TypeAdapter
 
@@ -108,6 +108,9 @@ class Target(BaseModel, frozen=True, extra="forbid"):
 
 class EvaluationSettings(BaseModel, frozen=True, extra="forbid"):
     """Evaluation while the run learns, on the last lesson's task, in environments of its own."""
+
+    # What a run may go on with other values of; its scores stay comparable.
+    changeable_keys: ClassVar[frozenset[str]] = frozenset({"interval", "stop_when"})
 
     interval: int = Field(ge=1, description="Steps of training between two evaluations.")
     episodes: int = Field(100, ge=1, description="Episodes of each evaluation.")

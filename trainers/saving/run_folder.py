@@ -18,11 +18,8 @@ from trainers.saving.run_lock import LOCK, RunLock
 CONFIGURATION = "configuration.yaml"
 CHECKPOINTS = "checkpoints"
 
-_FILE = re.compile(
-    r"(configuration\.yaml|policy\.json|status\.json|timers\.json)"
-    r"|\.(configuration\.yaml|policy\.json|status\.json|timers\.json)\.tmp"
-    r"|events\.out\.tfevents\..+"
-)
+_NAMES = "|".join(map(re.escape, (CONFIGURATION, "policy.json", "status.json", "timers.json")))
+_FILE = re.compile(rf"{_NAMES}|\.({_NAMES})\.tmp|events\.out\.tfevents\..+")
 """Names of a run's own files, as `trainers.run` and its log write them."""
 _FOLDERS = {CHECKPOINTS: checkpoint.own_names, EVALUATION: evaluation_folder.own_names}
 """A run's folders, and what finds the names of its own in them."""
