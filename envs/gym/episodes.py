@@ -26,8 +26,9 @@ def episode_seed(run_seed: int, index: int, episode: int) -> int:
 class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
     """One of a run's environments; seeds each of its episodes.
 
-    An environment may use an array again that it has handed out, so what an episode ended with is
-    copied before the next one begins.
+    An environment may use an array again that it has handed out, or share it with the others in its
+    process. So observations are copied before anything else happens, and so is the info that an
+    episode ended with.
 
     Args:
         env: the environment.
@@ -66,7 +67,7 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._begun += 1
         observation, _ = self.env.reset(seed=own, options=options)
         info, self._last_info = self._last_info, {}
-        return observation, info
+        return _copied(observation), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Steps the environment."""
@@ -74,9 +75,8 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         if not self._with_infos:
             info = {}
         if terminated or truncated:
-            observation, info = copy.deepcopy((observation, info))
-            self._last_info = info
-        return observation, reward, terminated, truncated, info
+            info = self._last_info = copy.deepcopy(info)
+        return _copied(observation), reward, terminated, truncated, info
 
     def play(self, lengths: NDArray[np.int64], actions: NDArray[Any]) -> Any:
         """Plays an episode from its beginning; returns the last observation.
@@ -88,4 +88,11 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         observation, _ = self.reset()
         for action in actions[len(actions) - lengths[self._index] :, self._index].copy():
             observation, *_ = self.env.step(action)
-        return observation
+        return _copied(observation)
+
+
+def _copied(observation: Any) -> Any:
+    """A copy of whatever a space holds; of an array in a fifth of the time of a deep copy."""
+    if isinstance(observation, np.ndarray):
+        return observation.copy()
+    return copy.deepcopy(observation)

@@ -438,6 +438,30 @@ def test_the_last_observation_is_not_overwritten_by_the_reset(
     assert diary.shown[-1].infos["seen"].tolist() == [[5.0], [10.0]]
 
 
+class Sharing(Reusing):
+    """Hands out one array that all the environments of a process write to."""
+
+    shared = np.zeros(1)
+
+    def __init__(self) -> None:
+        self.seen = self.shared
+
+
+def test_environments_that_share_an_array_see_their_own_observations() -> None:
+    gymnasium.register("ventosa_tests/Sharing-v0", entry_point=Sharing)
+    try:
+        env, other = (make("ventosa_tests/Sharing-v0", 3) for _ in range(2))
+    finally:
+        del gymnasium.registry["ventosa_tests/Sharing-v0"]
+    env.reset()
+    # Each environment adds half of its action to what is in the array that all of them have.
+    observations, *_ = env.step(np.array([[2.0], [4.0], [6.0]]))
+    assert observations["observation"].tolist() == [[1.0], [3.0], [6.0]]
+    # Played again, each begins with a reset of the array.
+    loaded = other.load_state_dict(env.state_dict())
+    assert loaded["observation"].tolist() == [[1.0], [2.0], [3.0]]
+
+
 def test_an_action_written_to_is_played_again_as_it_was(reusing: str) -> None:
     env, other = make(reusing, 2), make(reusing, 2)
     env.reset()
