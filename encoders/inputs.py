@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from torch import nn
 from torch.nn import functional as F
 
-from encoders.spaces import UINT8_MAX, DepthImage
+from encoders.spaces import DepthImage, low_and_span
 
 # Farther than any camera sees, and no less exact a number than a depth.
 FAR_AWAY_M = 1e4
@@ -73,12 +73,35 @@ class DepthInput(ImageInput):
         return scaled if seen is None else torch.cat([scaled, seen], dim=-1)
 
 
-class ByteInput(ImageInput):
-    """Color and any other image of bytes: to [0, 1]."""
+class BoundedInput(ImageInput):
+    """Color and any other image: to [0, 1] over the bounds of its space; see `low_and_span`.
+
+    Args:
+        space: The images; bounds may differ from pixel to pixel, and from channel to channel.
+    """
+
+    _low: torch.Tensor
+    _factor: torch.Tensor
+
+    def __init__(self, space: Box) -> None:
+        super().__init__(space)
+        low, span = low_and_span(space)
+        self._starts_at_0 = not low.any()
+        self._fits = self._starts_at_0 and bool((span == 1.0).all())
+        for name, values in (("_low", low), ("_factor", 1.0 / span)):
+            same = (values == values.flat[0]).all()
+            scale = torch.tensor(values.flat[0] if same else values, dtype=torch.float32)
+            self.register_buffer(name, scale, persistent=False)
 
     def scale(self, raw: torch.Tensor) -> torch.Tensor:
-        """Bytes to [0, 1]."""
-        return raw.to(torch.float32).mul_(1.0 / UINT8_MAX)
+        """Raw numbers to [0, 1]."""
+        if self._fits:
+            return super().scale(raw)
+        # In place, but never in the raw images: a copy of all pixels costs more than arithmetic.
+        scaled = raw.to(torch.float32, copy=True)
+        if not self._starts_at_0:
+            scaled.sub_(self._low)
+        return scaled.mul_(self._factor)
 
 
 def fill_gaps(depth_m: torch.Tensor) -> torch.Tensor:
@@ -158,7 +181,8 @@ class VectorInput(nn.Module):
 def image_input(space: Box, validity_channel: bool = False) -> ImageInput:
     """Builds the module that turns the raw images of a space into what a convolution takes.
 
-    Depth images become [0, 1] over the camera's range, other bytes [0, 1]; floats stay as they are.
+    Depth images become [0, 1] over the camera's range, other bytes and floats over the bounds of
+    their space; floats without bounds stay as they are.
 
     Args:
         space: Images of shape (height, width, channels).
@@ -182,10 +206,8 @@ def image_input(space: Box, validity_channel: bool = False) -> ImageInput:
             "validity_channel: only depth images say where nothing was seen, and these are "
             f"{space}: leave it out"
         )
-    if space.dtype == np.uint8:
-        return ByteInput(space)
-    if np.issubdtype(space.dtype, np.floating):
-        return ImageInput(space)
+    if space.dtype == np.uint8 or np.issubdtype(space.dtype, np.floating):
+        return BoundedInput(space)
     raise ValueError(
         f"images of {space.dtype} do not say how to scale them: declare depth as "
         "encoders.spaces.DepthImage, and others as uint8 or float"

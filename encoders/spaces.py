@@ -24,6 +24,9 @@ ROUNDING = 1e-6
 UINT8_MAX = 255
 UINT16_MAX = 65535
 
+LARGEST_BOUND = float(np.finfo(np.float32).max)
+"""Of floats: spaces that have no bounds say so with this, too."""
+
 DepthEncoding = Literal["uint8", "uint16"]
 
 
@@ -222,6 +225,23 @@ class RgbImage(Box):
     def __repr__(self) -> str:
         """Gives the size; everything else is fixed."""
         return f"RgbImage({self.shape[0]}, {self.shape[1]}{_said(self.sampling)})"
+
+
+def bounded(space: Box) -> NDArray[np.bool_]:
+    """Whether each number of a space has bounds on both sides, of the space's shape."""
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    return (low > -LARGEST_BOUND) & (high < LARGEST_BOUND)
+
+
+def low_and_span(space: Box) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What each number of a space begins at, and how far it goes from there, of the space's shape.
+
+    Subtracted, and divided by, they bring it to [0, 1]. They are 0 and 1, which change nothing,
+    where a bound is missing; the span of what can't vary is 1, too.
+    """
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    span = np.where(high > low, high - low, 1.0)
+    return np.where(bounded(space), low, 0.0), np.where(bounded(space), span, 1.0)
 
 
 def _check_size(height: int, width: int) -> None:

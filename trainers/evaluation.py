@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.environment import Environment
+from envs.environment import Environment, EnvironmentFailure
 from envs.evaluation import EvaluationReport, Evaluator, Figure, PhysicalCheck
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner
@@ -43,6 +43,8 @@ SEED_LIMIT = 2**31
 SEEDS_PER_BATCH = 2 * FIRST_SEED
 """From one batch of first actions to the next; runs and other evaluations have none of them."""
 FIRST_ACTION, WHOLE_EPISODE = 0, 1
+EPISODE_STEP_LIMIT = 100_000
+"""Steps in which episodes of an evaluation have to end: more than a game of Atari's takes."""
 
 
 class ActingPolicy(Protocol):
@@ -363,6 +365,9 @@ def _whole_episodes(
     """Plays until the first `episodes` to begin have ended.
 
     Those that end first would be the short ones, not like the others.
+
+    Raises:
+        EnvironmentFailure: one has not ended within `EPISODE_STEP_LIMIT` steps.
     """
     parts: list[EpisodeBatch] = []
     finished = 0
@@ -371,6 +376,11 @@ def _whole_episodes(
     while finished < episodes:
         actions, state = policy.predict(env_runner.observations, state, deterministic)
         done = env_runner.step(actions).done
+        if env_runner.longest_episode >= EPISODE_STEP_LIMIT:
+            raise EnvironmentFailure(
+                f"an episode of the evaluation has not ended in {EPISODE_STEP_LIMIT} steps: set a "
+                "limit, such as environment.max_episode_steps=1000 where it is gymnasium's"
+            )
         if state is not None:
             state[done] = 0.0
         parts.append(env_runner.pop_finished())

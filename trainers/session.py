@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import torch
+from gymnasium.spaces import Box
 from torch import Tensor
 
 from curricula.curriculum import Curriculum, FinishedEpisodes, State
 from curricula.samplers import ParameterValue
+from encoders.spaces import bounded
 from envs.environment import Environment
 from rewards.reward import RewardTerm
 from trainers.algorithms.base import Algorithm
@@ -18,12 +21,15 @@ from trainers.common.devices import resolve_device
 from trainers.common.errors import UserError, suggestion
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import EpisodeBatch
+from trainers.experience.frames import frame_spaces
 from trainers.inference.construction import network_factory
 from trainers.inference.metadata import Metadata
 from trainers.networks.factory import NetworkFactory
 from trainers.reporting.summary import RunPosition
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import Component, RunSettings
+
+_logger = logging.getLogger("ventosa")
 
 
 class Session:
@@ -59,6 +65,7 @@ class Session:
         env = build_environment(run, run.seed)
         try:
             self._check_parameters(env)
+            _warn_of_what_learns_badly(run, env)
             torch.manual_seed(run.seed)
             generator = torch.Generator(device).manual_seed(run.seed)
             self.env_runner = EnvRunner(env, stop_requested)
@@ -161,6 +168,23 @@ class Session:
                     f"{path}: the environment has no parameter {name!r}; "
                     f"{suggestion(name, env.parameter_names)}"
                 )
+
+
+def _warn_of_what_learns_badly(run: RunSettings, env: Environment) -> None:
+    """Tells of what a run may do, and hardly anybody wants."""
+    if not run.rewards and not env.pays_by_itself:
+        _logger.warning(
+            "rewards: the run file lists none, and the environment %r has none of its own: every "
+            "reward is 0, and nothing is learned",
+            run.environment.name,
+        )
+    for name, space in frame_spaces(env.single_observation_space).items():
+        if isinstance(space, Box) and not bounded(space).all():
+            _logger.warning(
+                "observation %r: images without bounds are taken as they are: declare bounds in "
+                "the environment's space, and they are scaled to [0, 1], as networks need it",
+                name,
+            )
 
 
 def build_environment(run: RunSettings, seed: int) -> Environment:

@@ -24,6 +24,9 @@ REWARD, AGE = "reward", "age"
 SCORING = "since_checkpoint"
 """Part of the saved state: the episodes that the next checkpoint's reward is the mean of."""
 
+ENDLESS_STEPS = (200, 50_000)
+"""Steps in which an episode may be meant to end: the limits of `_endless_from`."""
+
 
 @dataclass(frozen=True)
 class Ending:
@@ -73,6 +76,7 @@ class Training:
             self._saved_step, self._saved_score = resumed.step, resumed.score
             if SCORING in resumed.state:  # not in those of former versions
                 self._since_save.load_state_dict(resumed.state[SCORING])
+        self._told_of_endless = False
 
     def run(self) -> Ending:
         """Trains until there is reason to end; what was learned is saved.
@@ -125,6 +129,7 @@ class Training:
     def _update(self, run_fraction: float) -> None:
         """Learns from what was collected, and tells what came of it."""
         session, summary = self._session, self._summary
+        self._tell_of_endless()
         with timed("update"):
             summary.add(session.algorithm.update(run_fraction))
         env_runner = session.env_runner
@@ -137,6 +142,26 @@ class Training:
             self._display.message(begins)
         with timed("summary"):
             summary.report(session.position, env_runner.observations, self._display)
+
+    def _tell_of_endless(self) -> None:
+        """Says once that an episode seems to have no end, which keeps all figures waiting."""
+        env_runner = self._session.env_runner
+        steps = env_runner.longest_episode
+        if self._told_of_endless or steps < self._endless_from:
+            return
+        self._told_of_endless = True
+        self._display.message(
+            f"step {env_runner.step_count}: an episode has not ended for {steps} steps, and until "
+            "it does, none that began after it counts for rewards, success and lessons; if it has "
+            "no end, set a limit: environment.max_episode_steps, where it is gymnasium's"
+        )
+
+    @property
+    def _endless_from(self) -> float:
+        """Steps of an episode that may have no end: a third of what an environment takes in all."""
+        least, most = ENDLESS_STEPS
+        third = self._settings.max_steps / self._session.env_runner.env.num_envs / 3
+        return max(least, min(most, third))
 
     def _evaluate(self, step: int) -> bool:
         """Evaluates where it is time to, at each interval and at the run's end; whether it was."""

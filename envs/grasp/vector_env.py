@@ -62,6 +62,7 @@ class GraspVectorEnv(Environment):
 
     Settings = GraspSettings
     snapshot: ClassVar[type[GraspTransition]] = GraspTransition
+    pays_by_itself: ClassVar[bool] = False
     parameter_names: ClassVar[frozenset[str]] = frozenset(
         {*GOAL_PARAMETERS, *SENSOR_PARAMETERS, YAW_LIMIT}
     )

@@ -15,6 +15,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+IS_SUCCESS = "is_success"
+"""Key of an info that says whether the episode is a success, as Stable-Baselines3 reads it."""
+
 
 def episode_seed(run_seed: int, index: int, episode: int) -> int:
     """The seed, from 0 to 2^31 - 1, of an episode (from 0) of one of a run's environments."""
@@ -34,8 +37,8 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         env: the environment.
         run_seed: of the run.
         index: which of the run's environments it is, from 0.
-        with_infos: pass on the infos of steps. Otherwise they are empty: to gather those of many
-            environments takes longer than many a step.
+        with_infos: pass on the infos of steps. Otherwise they are empty, but for an episode's
+            success at its end: to gather those of many environments takes longer than many a step.
     """
 
     def __init__(
@@ -72,9 +75,10 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Steps the environment."""
         observation, reward, terminated, truncated, info = self.env.step(action)
+        ended = terminated or truncated
         if not self._with_infos:
-            info = {}
-        if terminated or truncated:
+            info = {IS_SUCCESS: info[IS_SUCCESS]} if ended and IS_SUCCESS in info else {}
+        if ended:
             info = self._last_info = copy.deepcopy(info)
         return _copied(observation), reward, terminated, truncated, info
 

@@ -11,7 +11,9 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from numpy.typing import NDArray
 
 from envs.environment import Environment, EnvironmentFailure, ObservationArrays, StepResult
+from envs.evaluation import SUCCESS
 from envs.gym.action_history import ActionHistory
+from envs.gym.episodes import IS_SUCCESS
 from envs.gym.making import make_vector_env
 from envs.gym.settings import GymSettings
 from envs.gym.spaces import ActionAdapter, ObservationAdapter
@@ -64,6 +66,7 @@ class GymEnvironment(Environment):
         # As many steps as the longest episode has.
         self._history = ActionHistory(self.action_space.shape or (), self.action_space.dtype)
         self._observations: ObservationArrays = {}
+        self._tells_success = False  # no episode that did has ended yet
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -123,6 +126,7 @@ class GymEnvironment(Environment):
             "lengths": self._lengths.copy(),
             "actions": self._history.actions,
             "observations": self._observations,
+            "tells_success": self._tells_success,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> ObservationArrays:
@@ -130,6 +134,7 @@ class GymEnvironment(Environment):
         self._seed = state["seed"]
         self._begun, self._lengths = state["begun"].copy(), state["lengths"].copy()
         self._history.load(state["actions"])
+        self._tells_success = state.get("tells_success", False)
         self._call("count_from", self._seed, self._begun - 1)
         played = self._call("play", self._lengths, state["actions"])
         self._observations = self._observe(self._stacked(played))
@@ -158,7 +163,21 @@ class GymEnvironment(Environment):
         self._begun[done] += 1
         self._lengths[done] = 0
         self._history.keep(int(self._lengths.max()))
-        return {"final_obs": self._final(gathered["final_obs"], done), "_final_obs": done}
+        final = self._final(gathered["final_obs"], done)
+        return {"final_obs": final, "_final_obs": done, **self._success(gathered, done)}
+
+    def _success(self, gathered: Mapping[str, Any], done: NDArray[np.bool_]) -> dict[str, Any]:
+        """Success of the episodes that ended, (N,), where the environment tells it.
+
+        Some tell nothing of an episode that is none: once one is known, the others are not.
+        """
+        self._tells_success |= IS_SUCCESS in gathered
+        if not self._tells_success:
+            return {}
+        success = np.zeros(self.num_envs, bool)
+        told = done & gathered.get(f"_{IS_SUCCESS}", False)
+        success[told] = [bool(value) for value in gathered.get(IS_SUCCESS, success)[told]]
+        return {"episode_metrics": {SUCCESS.metric: success}}
 
     def _final(self, last: NDArray[Any], done: NDArray[np.bool_]) -> ObservationArrays:
         """Observations (N, ...), right where episodes ended, from an array (N,) of objects."""

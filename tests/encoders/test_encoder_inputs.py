@@ -85,12 +85,52 @@ def test_straight_edges_stay_where_they_are(angle_deg, beyond_m):
         assert own_side or -0.55 < distance_px[row, column] < 0
 
 
-def test_floats_stay_as_they_are():
-    module = image_input(Box(-np.inf, np.inf, (2, 2, 4), dtype=np.float64))
-    raw = torch.randn(3, 2, 2, 4, dtype=torch.float64)
-    images = module(raw)
+LARGEST = np.finfo(np.float32).max
+
+
+@pytest.mark.parametrize(
+    ("bounds", "raw", "scaled"),
+    [
+        ((0.0, 255.0), [0.0, 51.0, 255.0], [0.0, 0.2, 1.0]),
+        ((-1.0, 1.0), [-1.0, -0.5, 1.0], [0.0, 0.25, 1.0]),
+        ((0.0, 1.0), [0.0, 0.3, 1.0], [0.0, 0.3, 1.0]),
+        ((20.0, 20.0), [20.0, 20.0, 20.0], [0.0, 0.0, 0.0]),
+        ((-np.inf, np.inf), [-7.0, 0.0, 300.0], [-7.0, 0.0, 300.0]),
+        ((0.0, np.inf), [0.0, 5.0, 300.0], [0.0, 5.0, 300.0]),
+        ((-LARGEST, LARGEST), [-7.0, 0.0, 300.0], [-7.0, 0.0, 300.0]),
+    ],
+)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_floats_are_scaled_over_their_bounds_if_they_have_any(bounds, raw, scaled, dtype):
+    values = torch.from_numpy(np.array(raw, dtype).reshape(1, 1, 3, 1))
+    before = values.clone()
+    images = image_input(Box(*bounds, (1, 3, 1), dtype))(values)
     assert images.dtype == torch.float32
-    assert images[2, 3, 0, 1] == raw[2, 0, 1, 3].float()
+    assert images.shape == (1, 1, 1, 3)
+    assert images.flatten().tolist() == pytest.approx(scaled, abs=1e-7)
+    assert torch.equal(values, before)
+
+
+def test_bounds_may_differ_from_channel_to_channel():
+    low = np.broadcast_to(np.float32([0, -2, 0]), (1, 2, 3))
+    high = np.broadcast_to(np.float32([10, 2, np.inf]), (1, 2, 3))
+    raw = torch.tensor([[[[0.0, -2.0, 30.0], [5.0, 1.0, 40.0]]]])
+    images = image_input(Box(low, high, dtype=np.float32))(raw)
+    assert images[0, :, 0].tolist() == [[0.0, 0.5], [0.0, 0.75], [30.0, 40.0]]
+
+
+def test_floats_from_0_to_1_and_bytes_are_the_same_to_the_last_bit():
+    floats = torch.rand(2, 3, 4, 1)
+    assert torch.equal(image_input(Box(0.0, 1.0, (3, 4, 1)))(floats), floats.permute(0, 3, 1, 2))
+    codes = torch.arange(256, dtype=torch.uint8)
+    expected = np.arange(256, dtype=np.float32) * np.float32(1 / 255)
+    images = image_input(RgbImage(1, 256))(codes.reshape(1, 1, 256, 1).expand(-1, -1, -1, 3))
+    np.testing.assert_array_equal(images[0, 2, 0].numpy(), expected)
+
+
+def test_bytes_of_two_values_are_zeros_and_ones():
+    images = image_input(Box(0, 1, (1, 2, 1), np.uint8))(torch.tensor([[[[0], [1]]]]).byte())
+    assert images.flatten().tolist() == [0.0, 1.0]
 
 
 def test_integers_of_unknown_meaning_are_refused():

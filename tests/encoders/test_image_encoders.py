@@ -137,7 +137,7 @@ def test_a_vector_has_no_validity_channel():
 
 
 def test_conv_is_a_sum_over_windows_then_the_activation():
-    encoder = conv(Box(-9, 9, (2, 3, 1)), [[1, 2, 1]], "elu")
+    encoder = conv(Box(-np.inf, np.inf, (2, 3, 1)), [[1, 2, 1]], "elu")
     layer = next(m for m in encoder.modules() if isinstance(m, nn.Conv2d))
     with torch.no_grad():
         layer.weight.copy_(torch.tensor([[[[1.0, 2.0], [3.0, 4.0]]]]))

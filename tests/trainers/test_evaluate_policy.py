@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 
-from envs.environment import Environment
+from envs.environment import Environment, EnvironmentFailure
 from envs.evaluation import Evaluator, error, rate
+from trainers import evaluation
 from trainers.common.errors import UserError
 from trainers.evaluation import FIRST_SEED, SEED_LIMIT, evaluate_policy
 from trainers.experience.env_runner import StopRequested
@@ -143,6 +144,18 @@ def test_scenes_are_of_the_seed_and_no_runs_own(
     assert seeds[6:9] == seeds[9:]
     assert len(set(seeds)) == 9
     assert min(seeds) >= FIRST_SEED
+
+
+def test_an_episode_without_an_end_is_told_with_what_to_set(
+    env: Environment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evaluation, "EPISODE_STEP_LIMIT", 3)
+    evaluate_policy(Counting(), env, EPISODES)  # of at most three steps
+    monkeypatch.setattr(env, "truncated", np.zeros((5, 2), bool))
+    policy = Counting()
+    with pytest.raises(EnvironmentFailure, match=r"not ended in 3 steps: set a limit.*max_epis"):
+        evaluate_policy(policy, env, EPISODES)
+    assert len(policy.deterministic) == 3
 
 
 def test_a_stop_ends_the_whole_episodes(env: Environment) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box
 
 from curricula.samplers import UniformSampler
 from trainers.common.errors import UserError
@@ -55,6 +56,42 @@ def test_an_image_too_small_for_its_encoder_names_the_encoders_key(
     assert message.startswith("encoders.camera (paper): a 8x8 image")
     # The default encoder has the same rule, and the same words.
     assert refused(make_run, registries, "picture").startswith("encoders.camera (simple): a 8x8")
+
+
+@pytest.mark.parametrize(
+    ("high", "told"), [(np.inf, True), (np.finfo(np.float32).max, True), (255.0, False)]
+)
+def test_images_without_bounds_are_told_once(
+    make_run: MakeRun,
+    registries: Registries,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    high: float,
+    told: bool,
+) -> None:
+    run = make_run("picture", encoders={"camera": {"type": "fully_connected"}})
+    space = Box(0.0, high, (8, 8, 1), np.float32)
+    monkeypatch.setattr(run.environment.cls, "spaces", lambda _: {"camera": space})
+    Session(run, registries).close()
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == told
+    assert all("'camera': images without bounds are taken as they are" in line for line in said)
+
+
+@pytest.mark.parametrize("rewards", [None, []])
+@pytest.mark.parametrize("pays_by_itself", [True, False])
+def test_a_run_in_which_nothing_is_paid_is_told(
+    make_run: MakeRun,
+    registries: Registries,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    rewards: Any,
+    pays_by_itself: bool,
+) -> None:
+    run = make_run("target", rewards=rewards)
+    monkeypatch.setattr(run.environment.cls, "pays_by_itself", pays_by_itself)
+    Session(run, registries).close()
+    assert ("rewards: the run file lists none" in caplog.text) is not pays_by_itself
 
 
 def test_an_encoder_of_the_wrong_kind_names_its_key(

@@ -458,6 +458,36 @@ def test_a_new_lesson_is_announced(training: Callable[..., Training]) -> None:
     assert one.quiet.messages == ["step 48: lesson 2 of 2 (fine) begins"]
 
 
+@pytest.mark.parametrize(("episode_steps", "told_at"), [(99, [32]), (4, [])])
+def test_an_episode_without_an_end_is_told_once_with_what_to_set(
+    training: Callable[..., Training],
+    monkeypatch: pytest.MonkeyPatch,
+    episode_steps: int,
+    told_at: list[int],
+) -> None:
+    # 64 steps of 4 environments are 16 of each, and a third of them is over after two collections.
+    monkeypatch.setattr(training_module, "ENDLESS_STEPS", (1, 1000))
+    one = training(environment={"type": "target", "episode_steps": episode_steps})
+    one.train()
+    assert [int(said.split(":")[0].removeprefix("step ")) for said in one.quiet.messages] == told_at
+    assert all("for 8 steps" in said for said in one.quiet.messages)
+    assert all("environment.max_episode_steps" in said for said in one.quiet.messages)
+
+
+@pytest.mark.parametrize(("limits", "told_at"), [((9, 1000), 48), ((1, 4), 16)])
+def test_an_episode_may_take_some_steps_of_any_run_but_no_more_than_any_takes(
+    training: Callable[..., Training],
+    monkeypatch: pytest.MonkeyPatch,
+    limits: tuple[int, int],
+    told_at: int,
+) -> None:
+    monkeypatch.setattr(training_module, "ENDLESS_STEPS", limits)
+    one = training(environment={"type": "target", "episode_steps": 99})
+    one.train()
+    (message,) = one.quiet.messages
+    assert message.startswith(f"step {told_at}: ")
+
+
 def test_a_finished_run_taken_up_again_is_finished_at_once(
     training: Callable[..., Training],
 ) -> None:

@@ -138,6 +138,11 @@ class EnvRunner:
         self.observations = observations
         return step
 
+    @property
+    def longest_episode(self) -> int:
+        """Steps of the longest of the running episodes."""
+        return int(self._length.max())
+
     def pop_finished(self) -> EpisodeBatch:
         """The finished episodes of the cohorts that were completed since the last call.
 

@@ -49,7 +49,10 @@ class EpisodeBatch:
 
 
 def concatenate(parts: Sequence[EpisodeBatch]) -> EpisodeBatch:
-    """Episodes of several batches, in their order."""
+    """Episodes of several batches, in their order.
+
+    Where one lacks a metric of another, its episodes are no successes, and other metrics are NaN.
+    """
     parts = [part for part in parts if len(part)]
     if not parts:
         return EpisodeBatch(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), {}, {})
@@ -59,10 +62,15 @@ def concatenate(parts: Sequence[EpisodeBatch]) -> EpisodeBatch:
         np.concatenate([part.lengths for part in parts]),
         {name: np.concatenate([part.terms[name] for part in parts]) for name in parts[0].terms},
         {
-            n: np.concatenate([part.episode_metrics[n] for part in parts])
-            for n in parts[0].episode_metrics
+            name: np.concatenate([_metric(part, name) for part in parts])
+            for name in dict.fromkeys(name for part in parts for name in part.episode_metrics)
         },
     )
+
+
+def _metric(episodes: EpisodeBatch, name: str) -> NDArray[np.float64]:
+    unknown = 0.0 if name == SUCCESS.metric else np.nan
+    return episodes.episode_metrics.get(name, np.full(len(episodes), unknown))
 
 
 class Cohorts:

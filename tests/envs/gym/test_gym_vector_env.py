@@ -390,6 +390,69 @@ def test_a_reward_for_another_snapshot_is_refused() -> None:
         make("CartPole-v1", rewards=[term])
 
 
+# -- success --------------------------------------------------------------------------------------
+
+
+class Telling(gymnasium.Env[Any, Any]):
+    """Episodes of 2, 3 and 2 steps in turn, of which the second is a success.
+
+    Args:
+        tells: in each info, at the end of an episode, at that of a success alone, or never.
+        word: what says that it is one.
+    """
+
+    observation_space = Box(0.0, 9.0, (1,), np.float32)
+    action_space = Discrete(2)
+
+    def __init__(self, tells: str = "always", word: Any = True):
+        self.tells, self.word, self.episode = tells, word, -1
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.episode, self.steps = self.episode + 1, 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        ends, good = self.steps == 2 + self.episode % 2, self.episode == 1
+        told = {"always": True, "end": ends, "success": ends and good}.get(self.tells, False)
+        info = {"is_success": type(self.word)(self.word if ends and good else 0)} if told else {}
+        return np.full(1, self.steps, np.float32), 0.0, ends, False, info
+
+
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+@pytest.mark.parametrize(
+    ("tells", "word", "expected"),
+    [
+        ("always", True, [False, True, False]),
+        ("end", 1.0, [False, True, False]),
+        ("end", np.bool_(True), [False, True, False]),
+        ("success", True, [None, True, False]),
+        ("never", True, [None, None, None]),
+    ],
+)
+@pytest.mark.parametrize("rewards", [[], [own_reward(1.0)]])
+def test_what_gymnasium_calls_is_success_is_success(
+    tells: str, word: Any, expected: list[Any], rewards: Any, vectorization: str
+) -> None:
+    gymnasium.register("ventosa_tests/Telling-v0", entry_point=Telling)
+    kwargs = {"tells": tells, "word": word}
+    made = {"rewards": rewards, "vectorization": vectorization, "kwargs": kwargs}
+    try:
+        env = make("ventosa_tests/Telling-v0", 2, **made)
+    finally:
+        del gymnasium.registry["ventosa_tests/Telling-v0"]
+    with closing(env):
+        env.reset()
+        infos = [env.step(np.zeros(2, int))[4] for _ in range(7)]
+    ends = [infos[step] for step in (1, 4, 6)]
+    metrics = [info.get("episode_metrics", {}).get("success") for info in ends]
+    assert [m if m is None else m.tolist() for m in metrics] == [
+        e if e is None else [e, e] for e in expected
+    ]
+    assert not any("episode_metrics" in infos[step] for step in (0, 2, 3, 5))
+
+
 # -- arrays of the environment's own --------------------------------------------------------------
 
 

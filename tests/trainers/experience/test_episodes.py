@@ -175,3 +175,13 @@ def test_episodes_are_joined_and_chosen() -> None:
     assert chosen.episode_metrics["success"].tolist() == [False, True]
     assert joined[:2].rewards.tolist() == [1.0, 2.0]
     assert len(empty) == len(concatenate([empty])) == len(empty.successes) == 0
+
+
+def test_episodes_that_say_nothing_of_success_are_none_beside_those_that_do() -> None:
+    """And what else they say nothing of is not known."""
+    tells = EpisodeBatch(*np.ones((3, 2)), {}, {"success": np.ones(2), "error_m": np.ones(2)})  # type: ignore[arg-type]
+    silent = EpisodeBatch(*np.ones((3, 1)), {}, {})  # type: ignore[arg-type]
+    for parts, success in (((silent, tells), [0, 1, 1]), ((tells, silent), [1, 1, 0])):
+        metrics = concatenate(parts).episode_metrics
+        assert metrics["success"].tolist() == success
+        assert np.isnan(metrics["error_m"]).tolist() == [not known for known in success]

@@ -31,6 +31,13 @@ def test_large_images_are_not_enlarged() -> None:
     assert picture(RgbImage(240, 320), frame).shape == frame.shape
 
 
+def test_pictures_go_from_bound_to_bound_or_from_0_to_1_without_bounds() -> None:
+    frame = np.float32([[[-1.0], [0.0], [0.5], [3.0]]])
+    for bounds, grays in (((-1.0, 3.0), [0, 64, 96, 255]), ((-np.inf, np.inf), [0, 0, 128, 255])):
+        image = picture(Box(*bounds, frame.shape, np.float32), frame)
+        assert image[0, 120::240, 0].tolist() == grays
+
+
 @pytest.mark.parametrize("channels", [1, 2])
 def test_other_channels_show_the_first_in_gray(channels: int) -> None:
     frame = np.full((240, 240, channels), 7, np.uint8)
