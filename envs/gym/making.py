@@ -13,6 +13,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from envs.gym.episodes import RepeatableEpisodes
 from envs.gym.settings import GymSettings
+from envs.gym.spaces import WRAP, flattens
 
 GymVectorEnv = SyncVectorEnv[Any, Any] | AsyncVectorEnv[Any, Any]
 EXTRAS = {"gymnasium.envs.mujoco": "mujoco", "gymnasium.envs.box2d": "box2d"}
@@ -28,14 +29,23 @@ def make_vector_env(settings: GymSettings, seed: int, *, with_infos: bool) -> Gy
         with_infos: see `RepeatableEpisodes`.
 
     Raises:
-        ValueError: it does not exist, lacks a package, or refuses its arguments.
+        ValueError: it does not exist, lacks a package, refuses its arguments, or can't be stepped
+            beside others.
     """
     makers = [
         partial(_make_one, settings, seed, index, with_infos) for index in range(settings.num_envs)
     ]
     vectorize = SyncVectorEnv if settings.vectorization == "sync" else AsyncVectorEnv
     # Whoever reads the observations copies them anyway.
-    return vectorize(makers, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
+    try:
+        return vectorize(makers, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
+    except ValueError:
+        raise
+    except Exception as error:
+        raise ValueError(
+            f"{settings.num_envs} of {settings.id!r} can't be stepped together: "
+            f"{type(error).__name__}: {error}"
+        ) from error
 
 
 def make(settings: GymSettings) -> gymnasium.Env[Any, Any]:
@@ -56,9 +66,16 @@ def make(settings: GymSettings) -> gymnasium.Env[Any, Any]:
         raise ValueError(
             f"{name!r} can't be made{given}: {type(error).__name__}: {error}"
         ) from error
-    if settings.flatten_observations:
-        env = gymnasium.wrappers.FlattenObservation(env)
-    return env
+    return _flattened(env) if settings.flatten_observations else env
+
+
+def _flattened(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+    space = env.observation_space
+    if not flattens(space):
+        raise ValueError(
+            f"flatten_observations: gymnasium makes no vector of the space {space}: {WRAP}"
+        )
+    return gymnasium.wrappers.FlattenObservation(env)
 
 
 def _make_one(

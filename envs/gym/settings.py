@@ -24,6 +24,11 @@ class GymSettings(BaseModel, frozen=True, extra="forbid"):
     flatten_observations: bool = Field(
         False, description="Make one vector of an observation, whatever its space is."
     )
+    channels: Literal["first", "last"] | None = Field(
+        None,
+        description="Which axis of images has the channels; null: the last, which has to be the "
+        "shortest then.",
+    )
     kwargs: dict[str, Any] = Field(
         default_factory=dict, description="What else gymnasium.make is given."
     )

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
+from encoders.spaces import DepthImage, RgbImage
 from envs.environment import ObservationArrays
 
+Channels = Literal["first", "last"] | None
+"""Axis of images that has the channels; None: the last, where no other can be meant."""
 OBSERVATION = "observation"
-IMAGE_CHANNELS = (1, 3, 4)
 WRAP = "register an id that wraps the environment (docs/gymnasium.md shows how)"
 
 
@@ -36,19 +38,20 @@ class ObservationAdapter:
 
     Args:
         space: of one environment. A Dict keeps its entries' names; anything else becomes the only
-            entry, `observation`.
+            entry, `observation`. Depth and color images of `encoders.spaces` stay what they are.
+        channels: of other images.
 
     Attributes:
-        space: what comes out.
+        space: what comes out; images have their channels last.
 
     Raises:
         ValueError: it holds what no encoder takes.
     """
 
-    def __init__(self, space: gymnasium.Space[Any]):
+    def __init__(self, space: gymnasium.Space[Any], channels: Channels = None):
         self._is_dict = isinstance(space, gymnasium.spaces.Dict)
         entries = space.spaces if isinstance(space, gymnasium.spaces.Dict) else {OBSERVATION: space}
-        self._parts = {name: _part(name, entry) for name, entry in entries.items()}
+        self._parts = {name: _part(name, entry, channels) for name, entry in entries.items()}
         self.space = gymnasium.spaces.Dict({k: part.space for k, part in self._parts.items()})
 
     def __call__(self, batch: Any) -> ObservationArrays:
@@ -92,18 +95,29 @@ class ActionAdapter:
         return np.asarray(actions, self.space.dtype) + self._start
 
 
-def _part(name: str, space: gymnasium.Space[Any]) -> Part:
+def flattens(space: gymnasium.Space[Any]) -> bool:
+    """Whether gymnasium makes one vector of what a space holds."""
+    try:
+        return bool(space.is_np_flattenable)
+    except NotImplementedError:  # a space of the environment's own
+        return False
+
+
+def _part(name: str, space: gymnasium.Space[Any], channels: Channels) -> Part:
     match space:
         case Discrete():
             return _one_hot(space)
         case Box() if len(space.shape) <= 1:
             return _vector(space)
+        case DepthImage() | RgbImage():
+            return Part(space, lambda batch: np.array(batch, space.dtype))
         case Box() if len(space.shape) == 3:
-            return _image(name, space)
+            return _image(name, space, channels)
+    flatten = "set flatten_observations: true, which makes one vector of it, or "
     raise ValueError(
         f"observation {name!r}: no encoder takes the space {space}; a Box of vectors (n,) or "
-        "images (height, width, channels), Discrete, and a Dict of these are supported: set "
-        f"flatten_observations: true, which makes one vector of it, or {WRAP}"
+        "images (height, width, channels), Discrete, and a Dict of these are supported: "
+        f"{flatten if flattens(space) else ''}{WRAP}"
     )
 
 
@@ -126,15 +140,20 @@ def _one_hot(space: Discrete) -> Part:
     )
 
 
-def _image(name: str, space: Box) -> Part:
-    """Images in their own type, but float32 for any float."""
-    first, _, last = space.shape
-    if first in IMAGE_CHANNELS and last not in IMAGE_CHANNELS:
+def _image(name: str, space: Box, channels: Channels) -> Part:
+    """Images in their own type, but float32 for any float, with their channels last."""
+    height, width, depth = space.shape
+    if channels is None and depth >= min(height, width):
         raise ValueError(
-            f"observation {name!r}: images of shape {space.shape} have their channels first, and "
-            f"encoders take (height, width, channels): {WRAP}"
+            f"observation {name!r}: images of shape {space.shape} do not say which axis has the "
+            "channels: set channels: first for (channels, height, width), or channels: last for "
+            "(height, width, channels)"
         )
+    axis = -3 if channels == "first" else -1
     dtype = np.float32 if np.issubdtype(space.dtype, np.floating) else space.dtype
     with np.errstate(over="ignore"):
-        low, high = space.low.astype(dtype), space.high.astype(dtype)
-    return Part(Box(low, high, dtype=dtype), lambda batch: np.array(batch, dtype))
+        low, high = (np.moveaxis(b.astype(dtype), axis, -1) for b in (space.low, space.high))
+    return Part(
+        Box(low, high, dtype=dtype),
+        lambda batch: np.array(np.moveaxis(batch, axis, -1), dtype, order="C"),
+    )

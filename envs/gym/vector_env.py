@@ -52,7 +52,9 @@ class GymEnvironment(Environment):
         self.num_envs = settings.num_envs
         self._vector = make_vector_env(settings, seed, with_infos=bool(rewards))
         try:
-            self._observe = ObservationAdapter(self._vector.single_observation_space)
+            self._observe = ObservationAdapter(
+                self._vector.single_observation_space, settings.channels
+            )
             self._act = ActionAdapter(self._vector.single_action_space)
         except ValueError:
             self.close()

@@ -8,13 +8,19 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import yaml
+from gymnasium.spaces import Box, Dict, Discrete
 
+from encoders.cameras import Pinhole
+from encoders.spaces import DepthImage
 from envs.gym.vector_env import GymEnvironment
 from trainers.algorithms.ppo import PPO
+from trainers.evaluation import evaluate
 from trainers.experience.env_runner import StopRequested
+from trainers.inference.policy import Policy
 from trainers.runfile.registry import BUILT_IN_PLUGINS, load_registries, plugin_manager
 from trainers.runfile.settings import load_run
 from trainers.saving.checkpoint import Checkpoints, Loaded
@@ -124,6 +130,45 @@ def test_mistakes_are_told_before_anything_starts(
     assert told.code == 2
     assert not told.results.exists()
     assert re.search(message, told.errors)
+
+
+class Cameras(gymnasium.Env[Any, Any]):
+    """A depth camera, and vectors, with names that are no attributes of modules."""
+
+    observation_space = Dict(
+        {
+            "hand.depth": DepthImage(16, 16, pinhole=Pinhole(20.0, 20.0, 8.0, 8.0)),
+            "type": Box(-1.0, 1.0, (2,), np.float32),
+            "values": Discrete(3),
+        }
+    )
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self.observation_space.sample(), 0.0, False, False, {"is_success": True}
+
+
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+def test_own_cameras_are_seen_as_those_of_the_grasp_task(
+    learn: Learn, write_run: WriteRun, vectorization: str
+) -> None:
+    gymnasium.register("ventosa_tests/Cameras-v0", entry_point=Cameras)
+    environment = {"id": "ventosa_tests/Cameras-v0", "vectorization": vectorization}
+    encoders = {"hand.depth": {"type": "keypoints", "keypoints": 2}}
+    try:
+        learned = learn(write_run({**PENDULUM, **environment}, encoders=encoders))
+        assert learned.code == 0, learned.errors
+        policy = Policy.load(str(learned.results / "toy"))
+        assert policy.observation_space["hand.depth"] == Cameras.observation_space["hand.depth"]
+        report = evaluate(str(learned.results / "toy"), episodes=2).report
+    finally:
+        del gymnasium.registry["ventosa_tests/Cameras-v0"]
+    assert report["success"] == 1.0
 
 
 def test_it_learns_to_balance_a_pole(make_session: Callable[..., Session]) -> None:

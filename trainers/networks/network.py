@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, ItemsView, Iterator, KeysView, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, Protocol, cast, runtime_checkable
 
@@ -48,6 +48,47 @@ class Standardizing(Protocol):
         """Shows it raw vectors (B, n)."""
 
 
+class EncoderDict(nn.ModuleDict):
+    """Encoders by their observations' names, whatever these are.
+
+    Where torch refuses a name for a module, because of its dots or because its classes have an
+    attribute of that name (`type`, `values`), the module's is `=` and the name with dots as `%2E`.
+    """
+
+    def __getitem__(self, name: str) -> nn.Module:
+        return super().__getitem__(_module_name(name))
+
+    def __setitem__(self, name: str, encoder: nn.Module) -> None:
+        super().__setitem__(_module_name(name), encoder)
+
+    def __contains__(self, name: str) -> bool:
+        return super().__contains__(_module_name(name))
+
+    def __iter__(self) -> Iterator[str]:
+        return map(_observation_name, super().__iter__())
+
+    def keys(self) -> KeysView[str]:
+        """Names of the observations."""
+        return dict(self.items()).keys()
+
+    def items(self) -> ItemsView[str, nn.Module]:
+        """Names of the observations, and their encoders."""
+        return dict(zip(self, self.values(), strict=True)).items()
+
+
+def _module_name(observation: str) -> str:
+    refused = "." in observation or hasattr(nn.ModuleDict(), observation)
+    if observation and not refused and not observation.startswith("="):
+        return observation
+    return "=" + observation.replace("%", "%25").replace(".", "%2E")
+
+
+def _observation_name(module: str) -> str:
+    if not module.startswith("="):
+        return module
+    return module[1:].replace("%2E", ".").replace("%25", "%")
+
+
 class Network(nn.Module):
     """Encodes observations, passes them through a trunk of dense layers, and perhaps a memory.
 
@@ -70,10 +111,10 @@ class Network(nn.Module):
         memory: MemorySettings | None = None,
     ):
         super().__init__()
-        self.frame_encoders = nn.ModuleDict(
+        self.frame_encoders = EncoderDict(
             {k: e for k, e in encoders.items() if is_frame(spaces[k])}
         )
-        self.vector_encoders = nn.ModuleDict(
+        self.vector_encoders = EncoderDict(
             {k: e for k, e in encoders.items() if not is_frame(spaces[k])}
         )
         width = sum(cast(int, encoder.features_dim) for encoder in encoders.values())

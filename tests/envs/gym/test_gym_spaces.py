@@ -7,11 +7,23 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Text, Tuple
+from gymnasium.spaces import (
+    Box,
+    Dict,
+    Discrete,
+    Graph,
+    MultiBinary,
+    MultiDiscrete,
+    Sequence,
+    Text,
+    Tuple,
+)
 from gymnasium.vector.utils import batch_space
 from hypothesis import given
 from hypothesis import strategies as st
 
+from encoders.cameras import Pinhole
+from encoders.spaces import DepthImage, RgbImage
 from envs.gym.spaces import ActionAdapter, ObservationAdapter
 
 LARGEST = np.finfo(np.float64).max
@@ -93,10 +105,49 @@ def test_what_no_encoder_takes_is_named_with_a_way_out(
         ObservationAdapter(Dict({"fine": Box(0.0, 1.0, (2,)), "odd": space}))
 
 
-def test_images_with_their_channels_first_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"\(3, 84, 84\) have their channels first"):
-        ObservationAdapter(Box(0, 255, (3, 84, 84), np.uint8))
+@pytest.mark.parametrize("space", [Sequence(Discrete(2)), Graph(Discrete(2), None)])
+def test_what_gymnasium_can_not_flatten_is_not_told_to_be_flattened(
+    space: gymnasium.Space[Any],
+) -> None:
+    with pytest.raises(ValueError, match=r"'odd'.*are supported: register an id that wraps"):
+        ObservationAdapter(Dict({"odd": space}))
+
+
+@pytest.mark.parametrize("channels", [None, "first", "last"])
+def test_images_of_cameras_stay_what_they_are(channels: Any) -> None:
+    camera = Pinhole(10.0, 11.0, 4.0, 4.5)
+    spaces = {"depth": DepthImage(8, 9, (0.3, 4.0), pinhole=camera), "color": RgbImage(2, 3)}
+    adapter = ObservationAdapter(Dict(spaces), channels)
+    for name, space in spaces.items():
+        assert adapter.space[name] is space
+        batch = np.array([space.sample(), space.sample()])
+        seen = adapter({"depth": batch, "color": batch})[name]
+        np.testing.assert_array_equal(seen, batch)
+        assert not np.shares_memory(seen, batch)
+
+
+@pytest.mark.parametrize(
+    "shape", [(3, 84, 84), (2, 84, 84), (24, 84, 84), (5, 5, 17), (84, 84, 84), (4, 3, 3)]
+)
+def test_a_shape_that_does_not_tell_the_channels_asks_for_them(shape: Any) -> None:
+    space = Box(0, 255, shape, np.uint8)
+    with pytest.raises(ValueError, match=r"'observation'.*do not say.*set channels: first .*last"):
+        ObservationAdapter(space)
+    assert ObservationAdapter(space, "last").space["observation"] == space
+    first = ObservationAdapter(space, "first").space["observation"]
+    assert first.shape == (*shape[1:], shape[0])
     ObservationAdapter(Box(0, 255, (4, 84, 3), np.uint8))  # four rows
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float64])
+def test_channels_that_come_first_are_put_last_with_their_bounds(dtype: Any) -> None:
+    high = np.broadcast_to(np.array([10, 200], dtype)[:, None, None], (2, 3, 4))
+    adapter = ObservationAdapter(Box(np.zeros((2, 3, 4), dtype), high, dtype=dtype), "first")
+    batch = np.arange(24, dtype=dtype).reshape(1, 2, 3, 4)
+    seen = adapter(batch)["observation"]
+    assert seen.flags.c_contiguous
+    assert seen[0, 1, 2].tolist() == [batch[0, 0, 1, 2], batch[0, 1, 1, 2]] == [6, 18]
+    assert (adapter.space["observation"].high[2, 3] == [10, 200]).all()  # type: ignore[attr-defined]
 
 
 def test_a_choice_of_action_is_counted_from_zero() -> None:

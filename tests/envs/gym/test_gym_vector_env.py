@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, Sequence
 
 from envs.environment import EnvironmentFailure
 from envs.gym.episodes import episode_seed
@@ -84,7 +85,7 @@ def registered() -> Iterator[None]:
 def make(
     env_id: str = "ventosa_tests/Room-v0",
     count: int = 3,
-    rewards: Sequence[RewardTerm[Any]] = (),
+    rewards: tuple[RewardTerm[Any], ...] | list[RewardTerm[Any]] = (),
     **settings: Any,
 ) -> GymEnvironment:
     return GymEnvironment(GymSettings(id=env_id, num_envs=count, **settings), rewards, seed=7)
@@ -246,6 +247,28 @@ def test_any_observation_can_be_flattened() -> None:
     env = make("Blackjack-v1", 2, flatten_observations=True)
     assert env.single_observation_space["observation"].shape == (32 + 11 + 2,)
     assert env.observation_space.contains(env.reset()[0])
+
+
+class Differing(gymnasium.Env[Any, Any]):
+    """Its observations are of a space that is given, or of as many numbers as were made before."""
+
+    action_space = Discrete(2)
+    made = itertools.count(1)
+
+    def __init__(self, space: Any = None):
+        self.observation_space = space or Box(0.0, 1.0, (next(self.made),))
+
+
+def test_what_gymnasium_can_not_flatten_or_put_side_by_side_is_named() -> None:
+    gymnasium.register("ventosa_tests/Differing-v0", entry_point=Differing)
+    sequences = {"kwargs": {"space": Sequence(Discrete(2))}}
+    try:
+        with pytest.raises(ValueError, match=r"^flatten_obs.* no vector.*Sequence.*wraps"):
+            make("ventosa_tests/Differing-v0", flatten_observations=True, **sequences)
+        with pytest.raises(ValueError, match=r"^3 of '.*Differing-v0' can't be .*: RuntimeError: "):
+            make("ventosa_tests/Differing-v0")
+    finally:
+        del gymnasium.registry["ventosa_tests/Differing-v0"]
 
 
 @pytest.mark.parametrize("vectorization", ["sync", "async"])

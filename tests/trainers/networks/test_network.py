@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from encoders.conv import Conv
@@ -83,6 +85,26 @@ def test_a_network_without_cameras_has_no_frame_features() -> None:
     vector = Vector(SPACES["joints"], Vector.Settings())
     network = Network({"joints": vector}, {"joints": SPACES["joints"]}, BARE)
     assert network.encode_frames({}) is None
+
+
+@given(st.lists(st.text() | st.sampled_from(["type", "values", "a.b", "a%2Eb", "="]), unique=True))
+def test_observations_may_have_any_names(names: list[str]) -> None:
+    encoders = {name: Mean(float(place)) for place, name in enumerate(names)}
+    network = Network(encoders, dict.fromkeys(names, SPACES["left"]), BARE)
+    assert list(network.frame_encoders) == list(network.frame_encoders.keys()) == names
+    assert dict(network.frame_encoders.items()) == encoders
+    assert all(network.frame_encoders[name] is encoders[name] for name in names)
+    assert "none of them" not in network.frame_encoders
+
+
+def test_weights_of_observations_are_named_after_them_where_torch_lets_them() -> None:
+    names = ["wrist-cam", "hand.depth", "type", "50% left"]
+    joints = SPACES["joints"]
+    encoders = {name: Vector(joints, Vector.Settings(normalize=True)) for name in names}
+    network = Network(encoders, dict.fromkeys(names, joints), BARE)
+    modules = ["wrist-cam", "=hand%2Edepth", "=type", "50% left"]
+    keys = [key.removeprefix("vector_encoders.") for key in network.state_dict()]
+    assert list(dict.fromkeys(key.split(".")[0] for key in keys)) == modules
 
 
 @pytest.mark.parametrize("layers", [0, 1, 3])
