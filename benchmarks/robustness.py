@@ -180,7 +180,7 @@ def plot(measured: Sequence[tuple[Fault, str, dict[str, Any]]], path: Path) -> N
     axes.set_yticks(range(len(texts)), texts)
     axes.invert_yaxis()
     axes.set_xlabel("first actions that succeed (%)")
-    axes.legend()
+    figure.legend(loc="outside upper center", ncols=len(strengths))
     figure.savefig(path)
 
 

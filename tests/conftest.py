@@ -46,7 +46,7 @@ from trainers.runfile.settings import Component, RunSettings, load_run
 from trainers.session import Session
 
 PICTURE_SIDE_PX = 8
-SHIPPED = Path(__file__).parents[1] / "policies" / "grasp"
+POLICIES = Path(__file__).parents[1] / "policies"
 
 
 class ToySettings(BaseModel, frozen=True, extra="forbid"):
@@ -565,9 +565,19 @@ def learn(
 
 @pytest.fixture(scope="session")
 def shipped_onnx(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The policy in policies/grasp_gaussian, whose images are small, as an ONNX file."""
+    return exported(tmp_path_factory, "grasp_gaussian")
+
+
+@pytest.fixture(scope="session")
+def structured_light_onnx(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The policy in policies/grasp as an ONNX file."""
+    return exported(tmp_path_factory, "grasp")
+
+
+def exported(tmp_path_factory: pytest.TempPathFactory, policy: str) -> Path:
     path = tmp_path_factory.mktemp("shipped") / "policy.onnx"
-    assert export([str(SHIPPED), str(path)]) == DONE
+    assert export([str(POLICIES / policy), str(path)]) == DONE
     return path
 
 

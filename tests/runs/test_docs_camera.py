@@ -15,7 +15,7 @@ from envs.views import CameraFile
 from trainers.evaluation import evaluation_environment, find_run
 from trainers.inference.onnx_policy import OnnxPolicy
 
-POLICY = Path(__file__).parents[2] / "policies" / "grasp"
+POLICY = Path(__file__).parents[2] / "policies" / "grasp_gaussian"
 PAGE = (Path(__file__).parents[2] / "docs/camera.md").read_text()
 (FILE,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
 (LOOP,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)

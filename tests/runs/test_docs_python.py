@@ -9,14 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from trainers.inference.policy import Policy
+
 REPOSITORY = Path(__file__).parents[2]
 PAGE = (REPOSITORY / "docs/python.md").read_text()
+SHAPE = Policy.load(REPOSITORY / "policies" / "grasp").observation_space["depth"].shape
 FIRST, LOOP, SURE = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
 def test_the_three_lines_answer_with_an_action(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(REPOSITORY)
-    known: dict[str, Any] = {"image": np.full((80, 80, 1), 1000, np.uint16)}
+    known: dict[str, Any] = {"image": np.full(SHAPE, 1000, np.uint16)}
     exec(FIRST, known)
     assert known["action"].shape == (4,)
 
@@ -49,7 +52,7 @@ def test_the_robot_moves_where_the_answer_is_sure(monkeypatch: pytest.MonkeyPatc
     class Robot:
         move_to = staticmethod(moves.append)
 
-    known: dict[str, Any] = {"image": np.zeros((80, 80, 1), np.uint16), "robot": Robot()}
+    known: dict[str, Any] = {"image": np.zeros(SHAPE, np.uint16), "robot": Robot()}
     exec(FIRST, known)
     exec(SURE, known)
     assert not known["answer"].sure  # of a black image

@@ -17,7 +17,7 @@ from trainers.runfile.registry import Registries
 from trainers.runfile.settings import load_run
 from trainers.runfile.yaml_document import dump, read
 
-POLICY = Path(__file__).parents[2] / "policies" / "grasp"
+POLICY = Path(__file__).parents[2] / "policies" / "grasp_gaussian"
 PRESENT = ("motion", "standoff_m", "contact_resolution_m")
 
 

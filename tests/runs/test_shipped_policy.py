@@ -1,4 +1,4 @@
-"""The policy in policies/grasp is what its card says."""
+"""The policies in policies/ are what their cards say."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from trainers.evaluation import FIRST_SEED, evaluate, evaluation_environment, fi
 from trainers.inference.fitting import load_raw_policy
 from trainers.inference.onnx_policy import OnnxPolicy
 
-POLICY = Path(__file__).parents[2] / "policies" / "grasp"
+POLICIES = sorted((Path(__file__).parents[2] / "policies").iterdir())
+POLICY = next(folder for folder in POLICIES if folder.name == "grasp")
 LARGEST_BYTES = 10_000_000
 
 
@@ -34,21 +35,27 @@ def test_the_shipped_policy_has_the_figures_of_its_evaluation_at_half_the_resolu
         assert finer[rate] == pytest.approx(found[rate], abs=0.002)
 
 
-def test_the_shipped_weights_are_small() -> None:
-    assert (POLICY / "weights.safetensors").stat().st_size < LARGEST_BYTES
+def test_a_new_user_finds_both() -> None:
+    assert [folder.name for folder in POLICIES] == ["grasp", "grasp_gaussian"]
 
 
-def test_the_card_quotes_the_evaluation() -> None:
-    told = json.loads((POLICY / "evaluation.json").read_text())
-    card = (POLICY / "README.md").read_text()
+@pytest.mark.parametrize("policy", POLICIES, ids=lambda folder: folder.name)
+def test_the_shipped_weights_are_small(policy: Path) -> None:
+    assert (policy / "weights.safetensors").stat().st_size < LARGEST_BYTES
+
+
+@pytest.mark.parametrize("policy", POLICIES, ids=lambda folder: folder.name)
+def test_the_card_quotes_the_evaluation(policy: Path) -> None:
+    told = json.loads((policy / "evaluation.json").read_text())
+    card = (policy / "README.md").read_text()
     for key in ("first_action_success", "success", "pick_rate"):
         assert f"{told[key]:.1%}".replace("%", " %") in card, key
     for error, factor, digits in (("position_error_m", 1000, 1), ("yaw_error_deg", 1, 2)):
         assert f"{told[error]['median'] * factor:.{digits}f} / " in card
 
 
-def test_the_onnx_file_says_what_the_shipped_policy_says(shipped_onnx: Path) -> None:
-    file, policy = OnnxPolicy.load(shipped_onnx), load_raw_policy(str(POLICY))
+def test_the_onnx_file_says_what_the_shipped_policy_says(structured_light_onnx: Path) -> None:
+    file, policy = OnnxPolicy.load(structured_light_onnx), load_raw_policy(str(POLICY))
     _, run = find_run(str(POLICY), [], Path("results"))
     with closing(evaluation_environment(run, 64)) as env:
         seen, _ = env.reset(seed=FIRST_SEED)
@@ -63,9 +70,9 @@ def test_the_onnx_file_says_what_the_shipped_policy_says(shipped_onnx: Path) -> 
     assert np.degrees(largest[3]) < 0.01
 
 
-def test_the_onnx_file_has_the_figures_of_the_shipped_policy(shipped_onnx: Path) -> None:
+def test_the_onnx_file_has_the_figures_of_the_shipped_policy(structured_light_onnx: Path) -> None:
     expected = evaluate(str(POLICY), episodes=128, seed=7).report
-    found = evaluate(str(shipped_onnx), episodes=128, seed=7).report
+    found = evaluate(str(structured_light_onnx), episodes=128, seed=7).report
     for rate in ("first_action_success", "success", "collision_rate"):
         # One scene may be at the edge: the policy itself calculates with bfloat16.
         assert found[rate] == pytest.approx(expected[rate], abs=1.5 / 128), rate

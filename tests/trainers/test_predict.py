@@ -19,7 +19,7 @@ from trainers.inference.policy import Policy
 from trainers.learn import DONE, MISTAKE
 from trainers.predict import main
 
-SHIPPED = Path(__file__).parents[2] / "policies" / "grasp"
+SHIPPED = Path(__file__).parents[2] / "policies" / "grasp_gaussian"
 CONFIGURATION = yaml.safe_load((SHIPPED / "configuration.yaml").read_text())
 ((CAMERA, MOUNTED),) = CONFIGURATION["environment"]["cameras"].items()
 SIZE = MOUNTED["height"], MOUNTED["width"]

@@ -307,7 +307,9 @@ def test_the_shipped_policy_needs_neither_environment_nor_optimizer() -> None:
     program = f"""
 import sys, numpy as np
 from trainers.inference.policy import Policy
-actions, _ = Policy.load({str(SHIPPED)!r}).predict(np.full((80, 80, 1), 1000, np.uint16))
+policy = Policy.load({str(SHIPPED)!r})
+image = np.full(policy.observation_space["depth"].shape, 1000, np.uint16)
+actions, _ = policy.predict(image)
 assert actions.shape == (4,), actions
 loaded = {{"pybullet", "numba", "envs.grasp.vector_env"}}
 print(sorted(loaded & set(sys.modules)))

@@ -17,7 +17,7 @@ from envs.grasp.settings import Camera, GraspSettings, Randomize, Surroundings
 from envs.grasp.vector_env import GraspVectorEnv
 from trainers.inference.policy import Policy
 
-SHIPPED = Path(__file__).parents[4] / "policies" / "grasp"
+POLICIES = sorted((Path(__file__).parents[4] / "policies").iterdir())
 COUNT = 12
 CAMERA = Camera(
     type="depth",
@@ -146,16 +146,17 @@ def test_colours_and_surroundings_are_shown() -> None:
     assert (around > 0).mean() > (kinds(settings_of())["no block"].observations["eye"] > 0).mean()
 
 
-def test_the_shipped_policy_is_never_sure_of_them() -> None:
-    policy = Policy.load(SHIPPED)
-    settings = shipped_settings()
+@pytest.mark.parametrize("folder", POLICIES, ids=lambda folder: folder.name)
+def test_the_shipped_policies_are_never_sure_of_them(folder: Path) -> None:
+    policy = Policy.load(folder)
+    settings = settings_of_policy(folder)
     for one in unanswerable(settings, load_robot(), 64, seed=123):
         assert not policy.answer(one.observations).sure.any(), one.kind
 
 
-def shipped_settings() -> GraspSettings:
+def settings_of_policy(folder: Path) -> GraspSettings:
     from trainers.evaluation import find_run
 
-    _, run = find_run(str(SHIPPED), (), Path("results"))
+    _, run = find_run(str(folder), (), Path("results"))
     assert isinstance(run.environment.settings, GraspSettings)
     return run.environment.settings
