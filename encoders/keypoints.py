@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from contextlib import AbstractContextManager, nullcontext
 from typing import Literal
 
-import numpy as np
 import torch
 from gymnasium.spaces import Box
-from numpy.typing import NDArray
 from pydantic import BaseModel, Field, PositiveInt
 from torch import nn
 
@@ -19,10 +16,9 @@ from encoders.points import (
     ATTENTION_GAIN,
     COORDINATES,
     MOMENTS,
-    UNITS_PER_M,
     UNSEEN,
+    PointEncoder,
     attended,
-    known_camera,
     middles,
     patch_rays,
     patches,
@@ -30,7 +26,7 @@ from encoders.points import (
 )
 
 
-class Keypoints(nn.Module):
+class Keypoints(PointEncoder):
     """Encoder ``keypoints``: depth -> points -> attention -> keypoints in the camera's frame.
 
     The image is looked at in overlapping patches. Each is described by its shape, which is its
@@ -73,8 +69,7 @@ class Keypoints(nn.Module):
         )
 
     def __init__(self, space: Box, settings: Settings) -> None:
-        super().__init__()
-        self.space = known_camera(space)
+        super().__init__(space, settings.precision)
         height, width, _ = space.shape
         if min(height, width) < settings.patch:
             raise ValueError(
@@ -83,7 +78,6 @@ class Keypoints(nn.Module):
             )
         self._patch, self._stride = settings.patch, settings.stride
         self._clip_m = settings.clip_m
-        self._lowered = settings.precision == "bfloat16"
         hidden, count = settings.hidden_units, settings.keypoints
         self.shape = dense(settings.patch**2, hidden, "relu")
         self.place = dense(hidden + COORDINATES, hidden, "relu")
@@ -92,12 +86,7 @@ class Keypoints(nn.Module):
         nn.init.zeros_(self.attention.bias)
         self.values = nn.Linear(hidden, settings.values)
         self.features_dim = count * (COORDINATES + MOMENTS + settings.values)
-        self.rays: torch.Tensor
-        assert self.space.pinhole is not None
-        rays = self._patch_rays(self.space.pinhole.rays(height, width))
-        self.register_buffer("rays", rays, persistent=False)
-        min_m, max_m = self.space.range_m
-        self._middle_m = math.sqrt(min_m * max_m)
+        self._know_rays()
 
     def forward(self, raw: torch.Tensor) -> torch.Tensor:
         """Raw depth images (B, H, W, 1) -> features (B, features_dim) float32."""
@@ -112,19 +101,6 @@ class Keypoints(nn.Module):
             values = self.values(described.float())
             return attended(attention, points, second_moments(points), values)
 
-    def set_rays(self, rays: NDArray[np.float64]) -> None:
-        """Looks through another camera than the space's.
-
-        Args:
-            rays: (H, W, 3) the points at depth 1 that pixels' centres see: x right, y down, z
-                forward.
-        """
-        self.rays.copy_(self._patch_rays(rays))
-
-    def _precision(self, device: torch.device) -> AbstractContextManager[object]:
-        # Never switches off what the network around it has chosen.
-        return torch.autocast(device.type, torch.bfloat16) if self._lowered else nullcontext()
-
     def _look(self, depth_m: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Depths (B, H, W) -> patches' shapes (B, n, p * p), middles (B, n, 3), seen (B, n).
 
@@ -136,15 +112,8 @@ class Keypoints(nn.Module):
         seen = middle.isfinite()
         middle = middle.clamp(max=self.space.range_m[1] / self._clip_m)
         shapes = (of_patches - middle[..., None, None]).clamp_(-1.0, 1.0)
-        middle_m = middle * self._clip_m
-        points = middle_m[..., None] * self.rays
-        points[..., 2] -= self._middle_m
-        return (
-            shapes.flatten(3).flatten(1, 2),
-            points.mul_(UNITS_PER_M).flatten(1, 2),
-            seen.flatten(1),
-        )
+        points = self._points(middle * self._clip_m)
+        return shapes.flatten(3).flatten(1, 2), points, seen.flatten(1)
 
-    def _patch_rays(self, rays: NDArray[np.float64]) -> torch.Tensor:
-        """Rays of pixels (H, W, 3) -> those of patches' middles (h, w, 3), float32."""
-        return patch_rays(torch.from_numpy(rays).float(), self._patch, self._stride)
+    def _patch_rays(self, rays: torch.Tensor) -> torch.Tensor:
+        return patch_rays(rays, self._patch, self._stride)

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager, nullcontext
+
+import numpy as np
 import torch
 from gymnasium.spaces import Box
+from numpy.typing import NDArray
+from torch import nn
 from torch.nn import functional as F
 
 from encoders.spaces import DepthImage
@@ -17,6 +24,62 @@ ATTENTION_GAIN = 4.0
 UNSEEN = -1e4  # the logit of what the camera does not see
 COORDINATES = 3
 MOMENTS = 6
+
+
+class PointEncoder(nn.Module, ABC):
+    """An encoder that describes patches of a depth image, each at the 3-D point of its middle.
+
+    A subclass calls `_know_rays` once it can tell `_patch_rays`.
+
+    Args:
+        space: the depth images.
+        precision: `float32` or `bfloat16`, of what describes patches.
+
+    Attributes:
+        space: the same.
+        rays: (h, w, 3) float32 of the patches' middles.
+
+    Raises:
+        ValueError: The space holds no depth images, or does not know its camera.
+    """
+
+    rays: torch.Tensor
+
+    def __init__(self, space: Box, precision: str) -> None:
+        super().__init__()
+        self.space = known_camera(space)
+        self._lowered = precision == "bfloat16"
+        min_m, max_m = self.space.range_m
+        self._middle_m = math.sqrt(min_m * max_m)
+
+    @abstractmethod
+    def _patch_rays(self, rays: torch.Tensor) -> torch.Tensor:
+        """Rays of pixels (H, W, 3) -> those of the patches' middles (h, w, 3)."""
+
+    def set_rays(self, rays: NDArray[np.float64]) -> None:
+        """Looks through another camera than the space's.
+
+        Args:
+            rays: (H, W, 3) the points at depth 1 that pixels' centres see: x right, y down, z
+                forward.
+        """
+        self.rays.copy_(self._patch_rays(torch.from_numpy(rays).float()))
+
+    def _know_rays(self) -> None:
+        height, width, _ = self.space.shape
+        assert self.space.pinhole is not None
+        rays = torch.from_numpy(self.space.pinhole.rays(height, width)).float()
+        self.register_buffer("rays", self._patch_rays(rays), persistent=False)
+
+    def _precision(self, device: torch.device) -> AbstractContextManager[object]:
+        # Never switches off what the network around it has chosen.
+        return torch.autocast(device.type, torch.bfloat16) if self._lowered else nullcontext()
+
+    def _points(self, depth_m: torch.Tensor) -> torch.Tensor:
+        """Depths of middles (B, h, w) -> their points (B, n, 3) around the range's middle."""
+        points = depth_m[..., None] * self.rays
+        points[..., 2] -= self._middle_m
+        return points.mul_(UNITS_PER_M).flatten(1, 2)
 
 
 def known_camera(space: Box) -> DepthImage:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from contextlib import AbstractContextManager, nullcontext
 from typing import Literal
 
-import numpy as np
 import torch
 from gymnasium.spaces import Box
-from numpy.typing import NDArray
 from pydantic import BaseModel, Field, PositiveInt
 from torch import nn
 
@@ -19,10 +16,9 @@ from encoders.points import (
     ATTENTION_GAIN,
     COORDINATES,
     MOMENTS,
-    UNITS_PER_M,
     UNSEEN,
+    PointEncoder,
     attended,
-    known_camera,
     middles,
     patch_rays,
     patches,
@@ -36,7 +32,7 @@ CHANNELS = 3
 IMAGES_AT_ONCE = 64
 
 
-class SecondLook(nn.Module):
+class SecondLook(PointEncoder):
     """Encoder ``second_look``: depth -> surfaces -> patches -> attention, twice -> features.
 
     Made for images with holes and ragged edges. Pixels are gathered into cells. Of each it is known
@@ -92,11 +88,9 @@ class SecondLook(nn.Module):
         )
 
     def __init__(self, space: Box, settings: Settings) -> None:
-        super().__init__()
-        self.space = known_camera(space)
+        super().__init__(space, settings.precision)
         self._settings = settings
         self._cells = _cells(self.space, settings)
-        self._lowered = settings.precision == "bfloat16"
         hidden, first = settings.hidden_units, settings.first_keypoints
         self.shape = dense(CHANNELS * settings.patch**2, hidden, "relu")
         self.place = dense(hidden + COORDINATES, hidden, "relu")
@@ -108,28 +102,13 @@ class SecondLook(nn.Module):
         self.queries = Queries(first * each, settings)
         self.second_values = nn.Linear(hidden, settings.values)
         self.features_dim = (first + settings.second_keypoints) * each
-        self.rays: torch.Tensor
-        height, width, _ = space.shape
-        assert self.space.pinhole is not None
-        rays = self._patch_rays(self.space.pinhole.rays(height, width))
-        self.register_buffer("rays", rays, persistent=False)
-        min_m, max_m = self.space.range_m
-        self._middle_m = math.sqrt(min_m * max_m)
+        self._know_rays()
 
     def forward(self, raw: torch.Tensor) -> torch.Tensor:
         """Raw depth images (B, H, W, 1) -> features (B, features_dim) float32."""
         if raw.device.type != "cpu" or torch.compiler.is_exporting():
             return self._encode(raw)
         return torch.cat([self._encode(part) for part in raw.split(IMAGES_AT_ONCE)])
-
-    def set_rays(self, rays: NDArray[np.float64]) -> None:
-        """Looks through another camera than the space's.
-
-        Args:
-            rays: (H, W, 3) the points at depth 1 that pixels' centres see: x right, y down, z
-                forward.
-        """
-        self.rays.copy_(self._patch_rays(rays))
 
     def _encode(self, raw: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():
@@ -151,10 +130,6 @@ class SecondLook(nn.Module):
                 [first, attended(attention, points, squares, second_values.float())], dim=1
             )
 
-    def _precision(self, device: torch.device) -> AbstractContextManager[object]:
-        # Never switches off what the network around it has chosen.
-        return torch.autocast(device.type, torch.bfloat16) if self._lowered else nullcontext()
-
     def _look(self, depth_m: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Depths (B, H, W) -> shapes (B, n, 3 * p * p), middles (B, n, 3), unseen (B, n, 1)."""
         settings = self._settings
@@ -168,21 +143,15 @@ class SecondLook(nn.Module):
         middle = middle.clamp(max=self.space.range_m[1] / settings.clip_m)
         relative = (of_patches - middle[..., None, None]).clamp_(-1.0, 1.0)
         shapes = [part.flatten(3) for part in (relative, *map(self._patches, (coverage, missing)))]
-        points = (middle * settings.clip_m)[..., None] * self.rays
-        points[..., 2] -= self._middle_m
-        return (
-            torch.cat(shapes, dim=-1).flatten(1, 2),
-            points.mul_(UNITS_PER_M).flatten(1, 2),
-            unseen.flatten(1)[..., None],
-        )
+        points = self._points(middle * settings.clip_m)
+        return torch.cat(shapes, dim=-1).flatten(1, 2), points, unseen.flatten(1)[..., None]
 
     def _patches(self, cells: torch.Tensor) -> torch.Tensor:
         return patches(cells, self._settings.patch, self._settings.stride)
 
-    def _patch_rays(self, rays: NDArray[np.float64]) -> torch.Tensor:
-        """Rays of pixels (H, W, 3) -> those of the patches' middle cells (h, w, 3), float32."""
+    def _patch_rays(self, rays: torch.Tensor) -> torch.Tensor:
         (high, wide), cell = self._cells, self._settings.cell
-        whole = torch.from_numpy(rays).float()[: high * cell, : wide * cell]
+        whole = rays[: high * cell, : wide * cell]
         of_cells = whole.unflatten(0, (high, cell)).unflatten(2, (wide, cell)).mean(dim=(1, 3))
         return patch_rays(of_cells, self._settings.patch, self._settings.stride)
 
