@@ -14,8 +14,9 @@ from typing import Any
 from trainers.common.errors import UserError
 from trainers.comparison.jobs import CORES, Job, run_missing
 from trainers.comparison.report import Experiments, write_report
-from trainers.comparison.results import RunResult, read_run
+from trainers.comparison.results import RunResult, read_run, read_status
 from trainers.learn import DONE, FAILED, MISTAKE
+from trainers.runfile.changes import differences
 from trainers.runfile.registry import Registries, load_registries
 from trainers.runfile.settings import dump_yaml, load_run
 from trainers.runfile.yaml_document import dotted, parse, read
@@ -51,13 +52,13 @@ class PlannedRun:
         learn += ["--run-id", self.folder.name, "--results-dir", str(self.folder.parent)]
         done = False
         if (self.folder / CONFIGURATION).is_file():
-            key = _first_difference(asked, read(self.folder / CONFIGURATION).data)
-            if key is not None:
+            found = read(self.folder / CONFIGURATION).data
+            for path, _, _ in differences(found, asked):
                 raise UserError(
                     f"{self.folder}: what is there was made by another run file than {self.config}:"
-                    f" {key} differs; choose another --results-dir"
+                    f" {dotted(path)} differs; choose another --results-dir"
                 )
-            done = read_run(self.folder).status.get("state") == FINISHED
+            done = read_status(self.folder).get("state") == FINISHED
             learn += ["--resume" if has_checkpoints(self.folder) else "--force"]
         return Job(self.folder.name, [learn], self.folder, done)
 
@@ -177,17 +178,6 @@ def _name_of(result: RunResult, known: Mapping[str, Sequence[RunResult]]) -> str
 
 def _but_seed(result: RunResult) -> dict[str, Any]:
     return {**result.configuration, "seed": None}
-
-
-def _first_difference(asked: Any, found: Any, path: tuple[str, ...] = ()) -> str | None:
-    """The key in which two files differ first; None: in none."""
-    if isinstance(asked, dict) and isinstance(found, dict):
-        for key in asked | found:
-            below = _first_difference(asked.get(key), found.get(key), (*path, key))
-            if below is not None:
-                return below
-        return None
-    return None if asked == found else dotted(path)
 
 
 if __name__ == "__main__":

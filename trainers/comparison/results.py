@@ -74,10 +74,17 @@ def read_run(folder: Path) -> RunResult:
     """
     if not (folder / CONFIGURATION).is_file():
         raise UserError(f"{folder}: this is no run: it has no {CONFIGURATION}")
-    return RunResult(folder, read(folder / CONFIGURATION).data, _status(folder), _curves(folder))
+    return RunResult(
+        folder, read(folder / CONFIGURATION).data, read_status(folder), _curves(folder)
+    )
 
 
-def _status(folder: Path) -> dict[str, Any]:
+def read_status(folder: Path) -> dict[str, Any]:
+    """What a run's `status.json` says; empty where there is none.
+
+    Raises:
+        UserError: it is damaged.
+    """
     path = folder / STATUS
     if not path.is_file():
         return {}

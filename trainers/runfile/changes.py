@@ -17,7 +17,7 @@ def changes(begun: RunSettings, now: RunSettings) -> list[str]:
     free = changeable(now)
     return [
         f"{dotted(path)}: {shown(before)} then, {shown(after)} now"
-        for path, before, after in _differences(resolved(begun), resolved(now), ())
+        for path, before, after in differences(resolved(begun), resolved(now))
         if dotted(path[:2]) not in free
     ]
 
@@ -40,15 +40,15 @@ def changeable(run: RunSettings) -> set[str]:
     }
 
 
-def _differences(before: Any, after: Any, path: KeyPath) -> Iterator[tuple[KeyPath, Any, Any]]:
+def differences(before: Any, after: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any, Any]]:
     """Innermost values that differ, by their paths; of another component its type alone."""
     if isinstance(before, dict) and isinstance(after, dict):
         types = [key for key in (TYPE_KEY, TRAINER_TYPE_KEY) if before.get(key) != after.get(key)]
         for key in types or before | after:
-            yield from _differences(before.get(key), after.get(key), (*path, key))
+            yield from differences(before.get(key), after.get(key), (*path, key))
     elif _are_sections(before) and _are_sections(after) and len(before) == len(after):
         for index, pair in enumerate(zip(before, after, strict=True)):
-            yield from _differences(*pair, (*path, index))
+            yield from differences(*pair, (*path, index))
     elif before != after:
         yield path, before, after
 
