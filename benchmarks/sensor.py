@@ -24,7 +24,7 @@ from rich.console import Console
 from benchmarks.command import tells_mistakes
 from benchmarks.tables import table
 from encoders.spaces import DepthImage
-from envs.grasp.observations import observation_space
+from envs.grasp.observations import observation_space, picture_seeds
 from envs.grasp.robot.urdf import load_robot
 from envs.grasp.scene.sampler import SceneSampler
 from envs.grasp.settings import GraspSettings
@@ -115,7 +115,7 @@ def camera(
     assert isinstance(space, DepthImage)
     simulator = FastSimulator(worlds, robot, settings.support)
     simulator.load(everywhere, scenes, np.tile(robot.home_rad, (worlds, 1)))
-    seeds = rng.integers(2**63, size=worlds, dtype=np.uint64)
+    seeds = picture_seeds(rng, worlds)
     return (
         partial(simulator.render_depth, everywhere, views["depth"], space, seeds),
         partial(simulator.render, everywhere, views["depth"]),

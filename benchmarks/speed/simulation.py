@@ -13,7 +13,7 @@ from benchmarks.agreement import RESOLUTION_M, ROBOT, Sample
 from benchmarks.speed.figures import FAST, MODES, PYBULLET, Figures, race, rate
 from encoders.spaces import DepthImage
 from envs.grasp.env import built_in_rewards, make_vector_env
-from envs.grasp.observations import observation_space
+from envs.grasp.observations import observation_space, picture_seeds
 from envs.grasp.settings import Camera, GraspSettings
 from envs.grasp.simulators.factory import make_simulator
 from envs.grasp.vector_env import GraspVectorEnv
@@ -119,6 +119,6 @@ class _Worlds:
         if self._space is None:
             self.simulator.render(everywhere, self._views)
         else:
-            seeds = self._rng.integers(2**63, size=len(everywhere), dtype=np.uint64)
+            seeds = picture_seeds(self._rng, len(everywhere))
             self.simulator.render_depth(everywhere, self._views, self._space, seeds)
         return len(everywhere)

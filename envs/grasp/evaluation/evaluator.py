@@ -8,6 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from encoders.spaces import MM_PER_M
 from envs.evaluation import (
     EvaluationOption,
     Evaluator,
@@ -24,7 +25,6 @@ from envs.grasp.evaluation.unanswerable import unanswerable
 from envs.grasp.robot.arm import Arm
 from envs.grasp.settings import GraspSettings
 
-MM_PER_M = 1000.0
 EVALUATION_OPTIONS: tuple[EvaluationOption, ...] = (
     RunFileOption("--simulator", "overrides `environment.simulator`", "environment.simulator"),
     PhysicalCheckOption("--pick", "have the robot pick up the block, in PyBullet"),
