@@ -172,6 +172,19 @@ class Evaluator:
         yield from ()
 
 
+def right_answers(
+    metrics: Mapping[str, NDArray[Any]], limits: Mapping[str, float]
+) -> NDArray[np.bool_]:
+    """Which of k actions are right, (k,): those with none of these metrics over its limit.
+
+    Args:
+        metrics: by name (k,), of the actions.
+        limits: of at least one of them; see `Evaluator.answer_limits`.
+    """
+    within = [metrics[name] <= limit for name, limit in limits.items()]
+    return np.asarray(np.all(within, axis=0))
+
+
 @dataclass(frozen=True)
 class RunFileOption:
     """An option of evaluation's command line that stands for a key of the run file.

@@ -7,18 +7,18 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from envs.environment import Environment
+from envs.evaluation import right_answers
 from trainers.common.errors import UserError, suggestion
 from trainers.common.files import write_atomically
 from trainers.evaluation import (
     SEEDS_PER_BATCH,
+    RecordedPolicy,
     evaluation_environment,
     find_run,
     first_actions,
@@ -63,32 +63,6 @@ EPISODES_PER_UNANSWERABLE = 40
 """There is one observation of each kind that can't be answered for so many episodes."""
 EPISODES_PER_HARDER = 20
 """There is one episode of each harder task for so many of the ordinary."""
-
-
-class RecordedPolicy:
-    """A policy that keeps the features of all actions that it chooses.
-
-    Args:
-        policy: acts.
-
-    Attributes:
-        features: (B, F) of each call.
-    """
-
-    def __init__(self, policy: Policy):
-        self._policy = policy
-        self.features: list[Tensor] = []
-
-    def predict(
-        self,
-        observations: Mapping[str, NDArray[Any]],
-        state: NDArray[Any] | None = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[Any], None]:
-        """See `Policy.first_actions`."""
-        actions, features = self._policy.first_actions(observations)
-        self.features.append(features)
-        return actions, None
 
 
 def calibrate(
@@ -276,5 +250,5 @@ def _examples(card: Card, features: Tensor, metrics: Metrics) -> Examples:
     return Examples(
         features,
         torch.from_numpy(relative).float(),
-        torch.from_numpy((values <= limits).all(axis=1)),
+        torch.from_numpy(right_answers(metrics, {e.metric: e.limit for e in card.errors})),
     )

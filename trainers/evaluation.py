@@ -10,7 +10,9 @@ from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from envs.environment import Environment, EnvironmentFailure
 from envs.evaluation import EvaluationReport, Evaluator, Figure, PhysicalCheck
@@ -77,32 +79,30 @@ class SavedPolicy(ActingPolicy, Protocol):
     action_space: gymnasium.Space[Any]
 
 
-class AnsweringPolicy:
-    """A policy that keeps how sure it was of its best actions.
+class RecordedPolicy:
+    """A policy that keeps the features of all actions that it chooses.
 
     Args:
-        policy: acts, and knows how sure it is.
+        policy: acts.
 
     Attributes:
-        sure: (B,) of each call for best actions.
+        features: (B, F) of each call.
     """
 
     def __init__(self, policy: Policy):
         self._policy = policy
-        self.sure: list[NDArray[np.bool_]] = []
+        self.features: list[Tensor] = []
 
     def predict(
         self,
         observations: Mapping[str, NDArray[Any]],
         state: NDArray[Any] | None = None,
         deterministic: bool = True,
-    ) -> tuple[NDArray[Any], NDArray[Any] | None]:
-        """See `ActingPolicy.predict`; the policy has no memory."""
-        if not deterministic:
-            return self._policy.predict(observations, state, deterministic)
-        answer = self._policy.answer(observations)
-        self.sure.append(answer.sure)
-        return answer.actions, state
+    ) -> tuple[NDArray[Any], None]:
+        """See `Policy.first_actions`."""
+        actions, features = self._policy.first_actions(observations)
+        self.features.append(features)
+        return actions, None
 
 
 @dataclass(frozen=True)
@@ -284,18 +284,9 @@ def evaluate_policy(
     first_seed = FIRST_SEED + 2 * seed
     first: dict[str, Any] = {}
     if evaluator.judges_first_action or check is not None or pictures is not None:
-        answering = None
-        if isinstance(policy, Policy) and policy.confidence is not None:
-            answering = AnsweringPolicy(policy)
-        metrics, outcomes = first_actions(
-            answering or policy, env_runner, episodes, first_seed + FIRST_ACTION, check, pictures
+        first = _first_action_report(
+            policy, env_runner, episodes, first_seed + FIRST_ACTION, check, pictures
         )
-        if evaluator.judges_first_action:
-            first |= summaries(first_action_figures(evaluator), metrics)
-        if answering is not None:
-            sure = np.concatenate(answering.sure)[:episodes]
-            first |= sureness_report(sure, evaluator.answer_limits, metrics)
-        first |= check_report(evaluator.check_name, outcomes)
     played = _whole_episodes(
         policy,
         env_runner,
@@ -305,6 +296,30 @@ def evaluate_policy(
     )
     whole = _episode_report(evaluator, played)
     return {"episodes": episodes, "seed": seed, **whole, **first}
+
+
+def _first_action_report(
+    policy: ActingPolicy,
+    env_runner: EnvRunner,
+    episodes: int,
+    seed: int,
+    check: PhysicalCheck | None,
+    pictures: EvaluationReport | None,
+) -> dict[str, Any]:
+    """Figures of first actions, how sure the policy is of them, and the physical check's."""
+    evaluator = env_runner.env.evaluator()
+    recorded = RecordedPolicy(policy) if isinstance(policy, Policy) else None
+    confidence = policy.confidence if isinstance(policy, Policy) else None
+    acting = policy if recorded is None or confidence is None else recorded
+    metrics, outcomes = first_actions(acting, env_runner, episodes, seed, check, pictures)
+    report: dict[str, Any] = {}
+    if evaluator.judges_first_action:
+        report |= summaries(first_action_figures(evaluator), metrics)
+    if recorded is not None and confidence is not None:
+        with torch.no_grad():
+            sure = confidence(torch.cat(recorded.features)[:episodes]).sure.cpu().numpy()
+        report |= sureness_report(sure, evaluator.answer_limits, metrics)
+    return report | check_report(evaluator.check_name, outcomes)
 
 
 def _episode_report(evaluator: Evaluator, played: EpisodeBatch) -> dict[str, Any]:

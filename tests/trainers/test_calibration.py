@@ -15,12 +15,13 @@ import torch
 from envs.evaluation import Evaluator
 from trainers import calibration
 from trainers.calibrate import main
-from trainers.calibration import FIRST_SEED, RecordedPolicy
+from trainers.calibration import FIRST_SEED
 from trainers.common.errors import UserError
 from trainers.evaluation import FIRST_SEED as FIRST_EVALUATED
 from trainers.evaluation import (
     SEED_LIMIT,
     SEEDS_PER_BATCH,
+    RecordedPolicy,
     evaluate,
     evaluation_environment,
     find_run,

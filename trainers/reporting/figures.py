@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.evaluation import SUCCESS, Evaluator, Figure, rate
+from envs.evaluation import SUCCESS, Evaluator, Figure, rate, right_answers
 from trainers.common.errors import UserError, suggestion
 
 Metrics = Mapping[str, NDArray[Any]]
@@ -94,6 +94,5 @@ def sureness_report(
     """
     report = {SURE: float(sure.mean())}
     if limits and sure.any():
-        right = np.all([metrics[name] <= limit for name, limit in limits.items()], axis=0)
-        report[SURE_RIGHT] = float(right[sure].mean())
+        report[SURE_RIGHT] = float(right_answers(metrics, limits)[sure].mean())
     return report
