@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 CORES = len(os.sched_getaffinity(0))
 
@@ -48,7 +49,7 @@ def run_missing(jobs: Sequence[Job], at_once: int) -> int:
 
 
 def _run(job: Job) -> int:
-    print(f"{job.name} begins", flush=True)
+    _say(f"{job.name} begins", sys.stdout)
     job.results.parent.mkdir(parents=True, exist_ok=True)
     environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     for command in job.commands:
@@ -62,6 +63,12 @@ def _run(job: Job) -> int:
             text=True,
         )
         if done.returncode:
-            print(f"{job.name} failed:\n{done.stderr}", file=sys.stderr)
+            _say(f"{job.name} failed:\n{done.stderr}", sys.stderr)
             return done.returncode
     return 0
+
+
+def _say(line: str, stream: TextIO) -> None:
+    # In one piece: print writes the line's end by itself, and jobs begin side by side.
+    stream.write(f"{line}\n")
+    stream.flush()

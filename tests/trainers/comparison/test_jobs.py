@@ -38,3 +38,12 @@ def test_a_failure_is_told_and_ends_the_job(
     assert "broken failed:\nthe reason" in capsys.readouterr().err
     assert not never.exists()
     assert (tmp_path / "other.json").exists()
+
+
+def test_lines_of_jobs_side_by_side_are_not_torn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writes: list[str] = []
+    monkeypatch.setattr("sys.stdout.write", writes.append)
+    run_missing([append(tmp_path / "first.json", "a")], at_once=1)
+    assert writes == ["first begins\n"]
