@@ -13,6 +13,7 @@ import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
 from trainers.common.files import naming, write_atomically
+from trainers.reporting.event_files import cut_after
 
 
 class RunLog:
@@ -23,9 +24,10 @@ class RunLog:
 
         Args:
             directory: the run's results; created if need be.
-            resumed_at: the step of the checkpoint from which the run goes on. TensorBoard then
-                hides what was logged after that step by the run that was cut off, so that no
-                point shows twice. Points at that very step stay.
+            resumed_at: the step of the checkpoint from which the run goes on. What was logged
+                after that step by the run that was cut off is taken back, so that no point is
+                there twice: off its files, and off a TensorBoard that has read them. Points at
+                that very step stay.
 
         Raises:
             OSError: the directory can't be written; names it.
@@ -35,6 +37,8 @@ class RunLog:
         purge_step = None if resumed_at is None else resumed_at + 1
         with naming(directory):
             directory.mkdir(parents=True, exist_ok=True)
+            if resumed_at is not None:
+                cut_after(directory, resumed_at)
             self._writer = SummaryWriter(str(directory), purge_step=purge_step)
             self._writer.flush()
 
