@@ -388,17 +388,21 @@ def test_a_run_that_goes_on_is_left_to_the_process_that_has_it(
     assert learn(config, option, "trainer.max_steps=80").code == 0
 
 
-def test_of_three_starts_of_one_run_one_goes_on_and_nothing_is_mixed(
-    learn: Learn, write_run: WriteRun
+@pytest.mark.parametrize(
+    "starts", [3, *(pytest.param(2 + n % 2, marks=pytest.mark.soak) for n in range(80))]
+)
+def test_of_starts_of_one_run_at_once_one_goes_on_and_nothing_is_mixed(
+    learn: Learn, write_run: WriteRun, starts: int
 ) -> None:
     config = write_run()
     results = config.parent / "results"
     started = [
-        in_another_process(config, "--seed", seed, "--results-dir", results) for seed in (1, 2, 3)
+        in_another_process(config, "--seed", seed, "--results-dir", results)
+        for seed in range(starts)
     ]
     codes = [exit_code(process) for process in started]
-    assert sorted(codes) == [0, 2, 2]
-    seed = 1 + codes.index(0)
+    assert sorted(codes) == [0] + [2] * (starts - 1)
+    seed = codes.index(0)
     written = yaml.safe_load((results / "toy/configuration.yaml").read_text())
     assert written["seed"] == seed
     assert learn(config, "--seed", seed, "--run-id", "alone").code == 0
