@@ -345,6 +345,11 @@ class GraspSettings(BaseModel, frozen=True, extra="forbid"):
         "this one; null: one per core.",
     )
     episode_steps: int = Field(10, ge=1, description="Actions before an episode is truncated.")
+    end_on_success: bool = Field(
+        True,
+        description="Whether an episode ends once position and rotation are right, or is always "
+        "episode_steps long: as many tries at every scene.",
+    )
     frame_grab: bool = Field(
         True, description="Observe the image taken at reset for the whole episode, or a stream."
     )

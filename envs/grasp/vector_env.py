@@ -135,7 +135,7 @@ class GraspVectorEnv(Environment):
             )
         transition = self._move(actions)
         terms = weigh(self._rewards, transition, self.num_envs)
-        terminated = transition.rotation_right
+        terminated = transition.rotation_right & self._settings.end_on_success
         steps = self._running().progress.steps
         truncated = ~terminated & (steps >= self._settings.episode_steps)
         infos = {

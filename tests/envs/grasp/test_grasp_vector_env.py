@@ -159,6 +159,17 @@ def test_images_lie_in_the_cameras_range(make: MakeEnv) -> None:
     assert (np.abs(depth[0].astype(int) - depth[1].astype(int)) > 10).mean() > 0.05
 
 
+def test_an_episode_may_go_on_after_success(make: MakeEnv) -> None:
+    env = make(2, episode_steps=3, end_on_success=False)
+    env.reset(seed=1)
+    actions = perfect(env)
+    for step in range(3):
+        _, _, terminated, truncated, infos = env.step(actions)
+        assert infos["episode_metrics"]["success"].all()
+        assert not terminated.any()
+        assert truncated.all() == (step == 2)
+
+
 @MODES
 def test_autoreset_happens_in_the_step_an_episode_ends_in(make: MakeEnv, frame_grab: bool) -> None:
     env = make(6, frame_grab=frame_grab, privileged=True)
