@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Literal
 
 import torch
+from gymnasium.spaces import Box
 from pydantic import BaseModel, Field, model_validator
 from torch import Tensor, nn
 
 from trainers.algorithms.optimization import optimizer_step
 from trainers.algorithms.schedules import LINEAR, Schedule
+from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.reward_normalizer import RewardNormalizer
 from trainers.experience.rollout import Rollout
@@ -27,6 +29,15 @@ class OnPolicyHyperparameters(BaseModel, frozen=True, extra="forbid"):
     learning_rate_schedule: Schedule = Field(LINEAR, description="Course of the learning rates.")
     gamma: float = Field(0.99, ge=0.0, le=1.0, description="Discount factor.")
     lambd: float = Field(0.95, ge=0.0, le=1.0, description="Lambda of the advantage estimate.")
+    baseline: Literal["critic", "frame"] = Field(
+        "critic",
+        description="What an action's return is compared with: the critic's value, or the mean "
+        "return of the other actions tried at the same frame, which needs gamma: 0.",
+    )
+    antithetic: bool = Field(
+        False,
+        description="Continuous actions: every second step mirrors the noise of the one before.",
+    )
     normalize_rewards: bool = Field(
         False, description="Scale rewards by the standard deviation of the discounted returns."
     )
@@ -38,6 +49,15 @@ class OnPolicyHyperparameters(BaseModel, frozen=True, extra="forbid"):
             raise ValueError(
                 f"batch_size {self.batch_size} is over buffer_size {self.buffer_size}: lower "
                 "batch_size, or raise buffer_size"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _tries_are_independent(self) -> OnPolicyHyperparameters:
+        if self.baseline == "frame" and self.gamma > 0.0:
+            raise ValueError(
+                f"baseline: frame needs gamma: 0, not {self.gamma:g}: with later rewards in it, "
+                "the return of another try depends on this one's action"
             )
         return self
 
@@ -53,6 +73,9 @@ class OnPolicyAlgorithm:
         env_runner: the environments.
         generator: the source of all randomness.
         device: where the policy lives.
+
+    Raises:
+        UserError: mirrored noise was asked for, and actions are discrete.
     """
 
     def __init__(
@@ -69,6 +92,11 @@ class OnPolicyAlgorithm:
             [{"params": list(group)} for group in groups], eps=1e-5, fused=True
         )
         self._gamma, self._lambd = hyperparameters.gamma, hyperparameters.lambd
+        if hyperparameters.antithetic and not isinstance(env_runner.env.single_action_space, Box):
+            raise UserError(
+                "trainer.hyperparameters.antithetic: mirrored noise is of continuous actions, and "
+                "the environment's are discrete: leave it out"
+            )
         count = env_runner.env.num_envs
         steps = -(-hyperparameters.buffer_size // count)
         self.collection_steps = steps * count
@@ -79,14 +107,17 @@ class OnPolicyAlgorithm:
             generator,
             device,
             RewardNormalizer(count, self._gamma) if hyperparameters.normalize_rewards else None,
+            antithetic=hyperparameters.antithetic,
         )
+        self._compares_tries = hyperparameters.baseline == "frame"
         self._max_gradient_norm = hyperparameters.max_gradient_norm
         self._env_runner, self._generator = env_runner, generator
         self._rollout: Rollout | None = None
 
     def collect(self) -> None:
         """See `Algorithm.collect`."""
-        self._rollout = self._collector.collect(self._gamma, self._lambd)
+        rollout = self._collector.collect(self._gamma, self._lambd)
+        self._rollout = rollout.against_other_tries() if self._compares_tries else rollout
 
     def state_dict(self) -> dict[str, Any]:
         """See `Algorithm.state_dict`."""

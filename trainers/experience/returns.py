@@ -50,6 +50,28 @@ def gae(
     return advantages, advantages + values
 
 
+@torch.no_grad()
+def leave_one_out(returns: Tensor, groups: Tensor) -> Tensor:
+    """Advantages over the mean return of the others of a group (Kool et al. 2019, eq. 8).
+
+    That mean is a baseline which the transition's own action has no part in, and knows all that
+    makes the group easy or hard. With antithetic noise the other of a pair has a part in it, which
+    lengthens the gradient by n / (n - 1) and does not turn it.
+
+    Args:
+        returns: (M,).
+        groups: (M,) int64, the number of the group that each belongs to.
+
+    Returns:
+        (M,); 0 for the only one of a group.
+    """
+    size = torch.bincount(groups)[groups].to(returns.dtype)
+    total = torch.zeros(int(groups.max()) + 1, dtype=returns.dtype, device=returns.device)
+    total = total.index_add_(0, groups, returns)[groups]
+    # R_i - sum_{j != i} R_j / (n - 1)
+    return torch.where(size > 1, returns - (total - returns) / (size - 1).clamp(min=1), 0.0)
+
+
 def normalize(advantages: Tensor) -> Tensor:
     """Shift and scale to mean 0 and (biased) standard deviation 1.
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from trainers.common.errors import UserError
+from trainers.experience.returns import leave_one_out
 from trainers.networks.observations import Observations, gather
 from trainers.networks.recurrent import Sequences
 
@@ -71,6 +73,20 @@ class Rollout:
         if len(distinct) < len(frames):
             frames, index = distinct, position
         return {name: gather(tensor, frames) for name, tensor in self.frames.items()}, index
+
+    def against_other_tries(self) -> Rollout:
+        """The same, with advantages over the mean return of the other actions at each frame.
+
+        Raises:
+            UserError: there are none.
+        """
+        if len(self.frame_index.unique()) == len(self):
+            raise UserError(
+                "trainer.hyperparameters.baseline: frame compares actions at the same frame, and "
+                "every frame was acted on once: use images that stay for several actions "
+                "(environment.frame_grab: true with episode_steps over 1), or baseline: critic"
+            )
+        return replace(self, advantages=leave_one_out(self.returns, self.frame_index))
 
     def in_shuffle_groups(self) -> Tensor:
         """All rows (M,), those of one group side by side and in the order of time."""

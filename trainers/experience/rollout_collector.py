@@ -52,11 +52,18 @@ class SampledActions:
     Args:
         policy: the actor and the critic.
         generator: the source of the actions' randomness.
+        antithetic: every second step mirrors the noise of the one before. Where both are tries at
+            the same observations, whatever is even in the noise cancels in the policy's gradient.
     """
 
-    def __init__(self, policy: ActorCritic, generator: torch.Generator):
-        self._policy, self._generator = policy, generator
+    def __init__(self, policy: ActorCritic, generator: torch.Generator, *, antithetic: bool):
+        self._policy, self._generator, self._antithetic = policy, generator, antithetic
+        self._noise: Tensor | None = None
         self.state_size = policy.state_size
+
+    def begin(self) -> None:
+        """The next step is the first of a pair."""
+        self._noise = None
 
     def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
         """See `Behavior.encode_frames`."""
@@ -67,8 +74,16 @@ class SampledActions:
     ) -> BehaviorOutput[DistributionAndValues]:
         """See `Behavior.act`."""
         distribution, values, hidden_state = self._policy.step(observations, features)
+        return BehaviorOutput(self._draw(distribution), hidden_state, (distribution, values))
+
+    def _draw(self, distribution: Distribution) -> Tensor:
+        if self._noise is not None:
+            actions, self._noise = distribution.mode() - self._noise, None
+            return actions
         actions = distribution.sample(self._generator)
-        return BehaviorOutput(actions, hidden_state, (distribution, values))
+        if self._antithetic:
+            self._noise = actions - distribution.mode()
+        return actions
 
 
 class RolloutCollector:
@@ -81,6 +96,7 @@ class RolloutCollector:
         generator: the source of the actions' randomness.
         device: where the policy lives.
         reward_normalizer: scales the rewards that are learned from; None: they stay as they are.
+        antithetic: see `SampledActions`.
     """
 
     def __init__(
@@ -91,10 +107,13 @@ class RolloutCollector:
         generator: torch.Generator,
         device: torch.device,
         reward_normalizer: RewardNormalizer | None = None,
+        *,
+        antithetic: bool = False,
     ):
         self._policy, self._env_runner, self._steps = policy, env_runner, steps
         self._device, self._reward_normalizer = device, reward_normalizer
-        self._collector = Collector(SampledActions(policy, generator), env_runner, device)
+        self._behavior = SampledActions(policy, generator, antithetic=antithetic)
+        self._collector = Collector(self._behavior, env_runner, device)
 
     @torch.no_grad()
     def collect(self, gamma: float, lambd: float) -> Rollout:
@@ -106,6 +125,7 @@ class RolloutCollector:
         collector = self._collector
         frames = collector.frame_store(self._steps)
         collector.begin()
+        self._behavior.begin()
         steps = [self._collect_step(frames) for _ in range(self._steps)]
         last = collector.to_tensors(self._env_runner.observations, collector.hidden_state)
         advantages, returns = self._estimate(steps, self._policy.value(last), gamma, lambd)

@@ -25,6 +25,7 @@ from trainers.algorithms.ppo import (
     clipped_value_loss,
     surrogate_loss,
 )
+from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner, NonFiniteError
 from trainers.experience.episodes import concatenate
 from trainers.inference.policy import Policy
@@ -485,3 +486,44 @@ def test_it_learns_from_images(make_ppo: MakePPO) -> None:
     first, last = learned(algorithm, 25)
     assert first < -0.55
     assert last > -0.25
+
+
+# -- many tries at a frame -----------------------------------------------------------------------
+
+
+def test_a_baseline_of_other_tries_needs_independent_ones() -> None:
+    with pytest.raises(ValidationError, match=r"baseline: frame needs gamma: 0, not 0\.99"):
+        PPOHyperparameters(baseline="frame")
+
+
+def test_mirrored_noise_is_of_continuous_actions(make_session: Callable[..., Session]) -> None:
+    with pytest.raises(UserError, match="antithetic: mirrored noise is of continuous actions"):
+        make_session("choice", {"hyperparameters": {"antithetic": True}})
+
+
+def test_tries_at_a_picture_tell_where_its_bar_stands(
+    make_session: Callable[..., Session],
+) -> None:
+    hyper = {
+        "gamma": 0.0,
+        "baseline": "frame",
+        "antithetic": True,
+        "buffer_size": 256,
+        "batch_size": 64,
+        "learning_rate": 1e-2,
+        "beta": 0.0,
+        **CONSTANT,
+    }
+    network = {"initial_std": 0.3, "hidden_units": 32}
+    environment = {"type": "picture", "num_envs": 32, "episode_steps": 8}
+    camera = {"camera": {"type": "conv", "layers": [[4, 3, 1]]}}
+    trainer = {"hyperparameters": hyper, "network_settings": network}
+    session = make_session(environment, trainer, encoders=camera)
+    rewards = []
+    for _ in range(40):
+        session.algorithm.collect()
+        session.algorithm.update(0.0)
+        rewards.append(float(session.env_runner.pop_finished().rewards.mean()))
+    # Of 8 tries, minus the distance each: guessing costs 4, noise of 0.3 costs 1.9 by itself.
+    assert rewards[0] < -4.0
+    assert rewards[-1] > -2.0, rewards

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trainers.experience.returns import explained_variance, gae, normalize
+from trainers.experience.returns import explained_variance, gae, leave_one_out, normalize
 
 
 def column(*numbers):
@@ -202,3 +202,24 @@ def test_explained_variance_of_equal_returns_is_zero(returns):
     values = torch.linspace(-1, 1, len(returns))
     assert explained_variance(returns, values) == 0
     assert explained_variance(returns, returns) == 0
+
+
+def test_a_return_is_compared_with_the_mean_of_the_others_of_its_group():
+    returns = torch.tensor([1.0, 5.0, 2.0, 6.0, 3.0])
+    groups = torch.tensor([2, 0, 2, 1, 2])
+    # Of group 2: 1 - (2 + 3) / 2, 2 - (1 + 3) / 2 and 3 - (1 + 2) / 2; 0 and 1 have one each.
+    assert leave_one_out(returns, groups).tolist() == [-1.5, 0.0, 0.0, 0.0, 1.5]
+
+
+@given(seed=st.integers(0, 10**6), count=st.integers(1, 40), kinds=st.integers(1, 6))
+def test_an_own_return_has_no_part_in_its_baseline(seed, count, kinds):
+    draw = torch.Generator().manual_seed(seed)
+    returns = torch.randn(count, generator=draw, dtype=torch.float64)
+    groups = torch.randint(kinds, (count,), generator=draw)
+    baseline = returns - leave_one_out(returns, groups)
+    others = [
+        [float(returns[j]) for j in range(count) if j != i and groups[j] == groups[i]]
+        for i in range(count)
+    ]
+    expected = [sum(o) / len(o) if o else float(returns[i]) for i, o in enumerate(others)]
+    assert baseline.tolist() == pytest.approx(expected, abs=1e-12)

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from encoders.spaces import DepthImage, RgbImage
+from trainers.common.errors import UserError
 from trainers.experience.frames import FrameStore
 from trainers.experience.rollout import Rollout
 
@@ -200,3 +201,14 @@ def test_memory_of_shared_frames_is_not_touched() -> None:
     )  # 1.2 GB if it were all written to
     store.add({"color": np.ones((2, 64, 64, 3), np.uint8)}, np.arange(2))
     assert len(store.tensors()["color"]) == 2
+
+
+def test_tries_are_compared_at_their_frame() -> None:
+    rollout = rollout_of(torch.tensor([0, 1, 0, 1])).against_other_tries()
+    assert rollout.advantages.tolist() == [-2.0, -2.0, 2.0, 2.0]  # of the returns 0, 1, 2, 3
+    assert rollout.returns.tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_single_tries_can_not_be_compared() -> None:
+    with pytest.raises(UserError, match=r"every frame was acted on once: .* or baseline: critic"):
+        rollout_of(torch.tensor([0, 1, 2])).against_other_tries()

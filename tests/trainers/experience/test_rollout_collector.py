@@ -17,7 +17,7 @@ from encoders.spaces import DepthImage
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.reward_normalizer import RewardNormalizer
 from trainers.experience.rollout import Rollout
-from trainers.experience.rollout_collector import RolloutCollector
+from trainers.experience.rollout_collector import RolloutCollector, SampledActions
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import Observations
@@ -398,3 +398,26 @@ def test_without_memory_there_is_nothing_to_remember(
     assert rollout.hidden_states.shape == (15, 0)
     assert torch.equal(rollout.shuffle_groups, rollout.frame_index)
     assert policy.initial_state(3).shape == (3, 0)
+
+
+@pytest.mark.parametrize("antithetic", [True, False])
+def test_every_second_step_mirrors_the_noise_of_the_one_before(
+    make_factory: MakeFactory, antithetic: bool
+) -> None:
+    policy = ActorCritic(make_factory(PLAIN.spaces), PolicySettings(num_layers=0, initial_std=2.0))
+    behavior = SampledActions(policy, torch.Generator().manual_seed(0), antithetic=antithetic)
+
+    def noise(x: float) -> Tensor:
+        observations = Observations({}, {"x": torch.full((500, 1), x)}, None)
+        acted = behavior.act(observations, policy.encode_frames({}))
+        return acted.actions - acted.output[0].mode()
+
+    with torch.no_grad():
+        behavior.begin()
+        first, mirrored, second = noise(0.0), noise(3.0), noise(0.0)
+        behavior.begin()
+        third = noise(0.0)
+    assert torch.allclose(first, -mirrored, atol=1e-5) == antithetic
+    for one, other in ((first, second), (second, third)):
+        assert abs(float((one * other).mean())) < 1.0  # 4 of the same; its deviation is 0.18
+    assert float(mirrored.std()) == pytest.approx(2.0, rel=0.2)
