@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from trainers.common.errors import UserError
 from trainers.runfile.yaml_document import read
 from trainers.saving.run_folder import CONFIGURATION
+from trainers.saving.run_lock import is_held
 
 STATUS = "status.json"
 REWARD, SPEED = "Environment/Cumulative Reward", "Performance/Steps Per Second"
@@ -82,6 +83,8 @@ def read_run(folder: Path) -> RunResult:
 def read_status(folder: Path) -> dict[str, Any]:
     """What a run's `status.json` says; empty where there is none.
 
+    A process that was killed leaves "running" there: without one, the run is interrupted.
+
     Raises:
         UserError: it is damaged.
     """
@@ -94,6 +97,8 @@ def read_status(folder: Path) -> dict[str, Any]:
         raise UserError(f"{path}: can't be read: {error}") from error
     if not isinstance(status, dict):
         raise UserError(f"{path}: should be an object, with `state` and `step`")
+    if status.get("state") == "running" and not is_held(folder):
+        status |= {"state": "interrupted", "reason": "its process was killed"}
     return status
 
 

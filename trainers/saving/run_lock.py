@@ -118,6 +118,24 @@ class RunLock:
         return None
 
 
+def is_held(directory: Path) -> bool:
+    """Whether another process writes into a run's folder, as far as can be told from here."""
+    try:
+        descriptor = os.open(directory / LOCK, os.O_RDONLY)
+    except FileNotFoundError:
+        return False
+    try:
+        holder = _read(descriptor)
+        if holder is not None and not holder.is_near(Holder.this_process()):
+            return True
+        fcntl.lockf(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
 def _is_at(descriptor: int, path: Path) -> bool:
     """Whether an open file still has its name."""
     try:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from trainers.common.errors import UserError
-from trainers.comparison.results import REWARD, SPEED, RunResult, read_run
+from trainers.comparison import results
+from trainers.comparison.results import REWARD, SPEED, RunResult, read_run, read_status
 from trainers.reporting.event_log import RunLog
 from trainers.saving.run_folder import CONFIGURATION
 
@@ -69,6 +70,24 @@ def test_a_damaged_status_is_named(folder: Path, status: str, message: str) -> N
     (folder / "status.json").write_text(status)
     with pytest.raises(UserError, match=message):
         read_run(folder)
+
+
+@pytest.mark.parametrize(
+    ("state", "held", "said"),
+    [
+        ("running", True, ("running", None)),
+        ("running", False, ("interrupted", "its process was killed")),
+        ("finished", False, ("finished", None)),
+    ],
+)
+def test_a_run_goes_on_as_long_as_a_process_writes_into_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, state: str, held: bool, said: tuple[str, str]
+) -> None:
+    monkeypatch.setattr(results, "is_held", lambda directory: held and directory == folder)
+    (folder / "status.json").write_text(json.dumps({"state": state, "step": 3}))
+    status = read_status(folder)
+    assert (status["state"], status.get("reason")) == said
+    assert status["step"] == 3
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from trainers.common.errors import UserError
-from trainers.saving.run_lock import LOCK, Holder, RunLock
+from trainers.saving.run_lock import LOCK, Holder, RunLock, is_held
 
 REPOSITORY = Path(__file__).parents[3]
 HOLD = """
@@ -56,8 +56,10 @@ def test_the_process_that_holds_it_is_named_and_a_killed_one_is_taken_over(tmp_p
             refused.value
         )
         assert json.loads((tmp_path / "run" / LOCK).read_text())["pid"] == process.pid
+        assert is_held(tmp_path / "run")
         process.kill()
         process.wait()
+        assert not is_held(tmp_path / "run")
         lock = RunLock(tmp_path / "run")  # though its worker has outlived it
         assert json.loads((tmp_path / "run" / LOCK).read_text())["pid"] == os.getpid()
         lock.close()
@@ -76,6 +78,7 @@ def test_another_machine_is_believed(tmp_path: Path) -> None:
     before = path.read_text()
     with pytest.raises(UserError, match=rf"on elsewhere, since .*: if it is over, remove {path}"):
         RunLock(tmp_path)
+    assert is_held(tmp_path)
     assert path.read_text() == before
 
 
@@ -87,6 +90,7 @@ def test_the_same_machine_under_another_name_or_restarted_is_not(
     boot.write_text("this one\n")
     monkeypatch.setattr("trainers.saving.run_lock.BOOT_ID", boot)
     path = left_behind(tmp_path, **fields)
+    assert not is_held(tmp_path)
     RunLock(tmp_path).close()
     assert not path.exists()
 
