@@ -20,8 +20,9 @@ from typing import Any
 import yaml
 from rich.console import Console
 
-from benchmarks.command import ROOT, add_options, tells_mistakes
+from benchmarks.command import ROOT, add_options
 from benchmarks.tables import table, write_between
+from trainers.common.command import tells_failures
 from trainers.common.errors import UserError
 from trainers.comparison.jobs import Job, run_missing
 from trainers.comparison.tables import markdown
@@ -78,7 +79,7 @@ def load_recipes() -> dict[str, Recipe]:
     }
 
 
-@tells_mistakes
+@tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains and evaluates what is missing, and reports on all."""
     options = parse(arguments)

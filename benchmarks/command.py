@@ -1,22 +1,16 @@
-"""What the commands have in common: mistakes told, extras asked for, jobs and their results."""
+"""What the commands have in common: extras asked for, jobs and their results."""
 
 from __future__ import annotations
 
 import argparse
-import functools
 import importlib.util
-import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import ParamSpec
 
 from trainers.common.errors import UserError
 from trainers.comparison.jobs import CORES
-from trainers.learn import MISTAKE
 
 ROOT = Path(__file__).parents[1]
 INSTALL = "pip install -c constraints.txt -e '.[bench]'"
-P = ParamSpec("P")
 
 
 def missing(*packages: str) -> list[str]:
@@ -34,20 +28,6 @@ def require(*packages: str) -> None:
         raise UserError(
             f"not installed: {', '.join(absent)}, of the extra `bench`; install it with: {INSTALL}"
         )
-
-
-def tells_mistakes(main: Callable[P, int]) -> Callable[P, int]:
-    """A command whose user's mistakes are an `error: ...` and exit code 2."""
-
-    @functools.wraps(main)
-    def command(*arguments: P.args, **options: P.kwargs) -> int:
-        try:
-            return main(*arguments, **options)
-        except UserError as mistake:
-            print(f"error: {mistake}", file=sys.stderr)
-            return MISTAKE
-
-    return command
 
 
 def add_options(parser: argparse.ArgumentParser, results: str) -> None:

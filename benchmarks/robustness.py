@@ -18,9 +18,10 @@ from typing import Any
 import yaml
 from rich.console import Console
 
-from benchmarks.command import require, tells_mistakes
+from benchmarks.command import require
 from benchmarks.tables import table, write_between
 from envs.grasp.settings import GraspSettings
+from trainers.common.command import tells_failures
 from trainers.common.errors import UserError
 from trainers.comparison.tables import markdown
 from trainers.evaluation import evaluate, find_run
@@ -79,7 +80,7 @@ def load_faults() -> list[Fault]:
     return faults
 
 
-@tells_mistakes
+@tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluates under every fault, and prints the table; returns the exit code."""
     options = parse(arguments)

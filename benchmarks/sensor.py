@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from benchmarks.command import tells_mistakes
 from benchmarks.tables import table
 from encoders.spaces import DepthImage
 from envs.grasp.observations import observation_space, picture_seeds
@@ -29,6 +28,7 @@ from envs.grasp.robot.urdf import load_robot
 from envs.grasp.scene.sampler import SceneSampler
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.fast import FastSimulator
+from trainers.common.command import tells_failures
 from trainers.common.errors import UserError
 
 Frame = NDArray[np.uint16]
@@ -135,7 +135,7 @@ def frames_per_second(view: dict[str, Any]) -> dict[str, float]:
     return {name: SPEED_WORLDS / spent_s for name, spent_s in best.items()}
 
 
-@tells_mistakes
+@tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures and prints."""
     options = parse(arguments)

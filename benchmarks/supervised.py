@@ -25,12 +25,12 @@ from rich.console import Console
 from torch import Tensor
 from torch.nn import functional as F
 
-from benchmarks.command import tells_mistakes
 from envs.grasp.scene.sampler import heading
 from envs.grasp.vector_env import GraspVectorEnv
 from trainers.algorithms.ddpg import DDPGSettings
 from trainers.algorithms.ppo import PPOSettings
 from trainers.algorithms.trpo import TRPOSettings
+from trainers.common.command import tells_failures
 from trainers.common.errors import UserError
 from trainers.evaluation import FIRST_SEED
 from trainers.networks.actions import to_environment
@@ -50,7 +50,7 @@ WARM_UP_STEPS = 100
 MAX_GRADIENT_NORM = 5.0
 
 
-@tells_mistakes
+@tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Fits, and prints how far it has come."""
     options = parse(arguments)

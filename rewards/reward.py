@@ -13,6 +13,10 @@ SnapshotT = TypeVar("SnapshotT")
 SnapshotT_contra = TypeVar("SnapshotT_contra", contravariant=True)
 
 
+class RewardError(ValueError):
+    """A reward returned anything but numbers (N,); the message names it."""
+
+
 class Reward(Protocol[SnapshotT_contra]):
     """A term of the reward, built from its ``Settings``; the environment applies its weight.
 
@@ -68,13 +72,19 @@ def weigh(
     """Weighted rewards (N,) of one step of N = `count` environments, by name.
 
     Raises:
-        ValueError: a reward returned anything but N numbers; the message names it.
+        RewardError: a reward returned anything but N numbers.
     """
     weighted = {}
     for term in terms:
-        values = np.asarray(term.reward(snapshot), dtype=np.float64)
+        returned = term.reward(snapshot)
+        try:
+            values = np.asarray(returned, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise RewardError(
+                f"the reward {term.name!r} returned no numbers: {error}; it must return ({count},)"
+            ) from error
         if values.shape != (count,):
-            raise ValueError(
+            raise RewardError(
                 f"the reward {term.name!r} returned an array of shape {values.shape} for {count} "
                 f"environments: it must return ({count},)"
             )

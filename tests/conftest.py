@@ -5,6 +5,7 @@ The helpers are handed out by fixtures, because a `conftest` can't be imported r
 
 from __future__ import annotations
 
+import sys
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -36,10 +37,11 @@ from trainers import evaluation
 from trainers import run as run_module
 from trainers.algorithms.ppo import PPO
 from trainers.algorithms.trpo import TRPO
+from trainers.common.command import DONE
 from trainers.export import main as export
 from trainers.hookspecs import hookimpl
 from trainers.inference.construction import network_factory
-from trainers.learn import DONE, main
+from trainers.learn import main
 from trainers.networks.factory import NetworkFactory
 from trainers.runfile.registry import BUILT_IN_PLUGINS, Registries, load_registries, plugin_manager
 from trainers.runfile.settings import Component, RunSettings, load_run
@@ -402,6 +404,33 @@ class ToyPlugin:
     @hookimpl
     def ventosa_rewards(self) -> dict[str, type]:
         return {"breaking": NanReward}
+
+
+@pytest.fixture
+def install_plugin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[[str, str], Path]]:
+    """Lays out a module as pip would, as a plugin called `own`: `install_plugin(module, source)`.
+
+    Returns the folder that it is in, which other processes need on their path.
+    """
+    folder = tmp_path / "site"
+    modules = []
+
+    def install(module: str, source: str) -> Path:
+        info = folder / f"{module}-1.2.dist-info"
+        info.mkdir(parents=True)
+        name = module.replace("_", "-")
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.2\n")
+        (info / "entry_points.txt").write_text(f"[ventosa]\nown = {module}\n")
+        (folder / f"{module}.py").write_text(source)
+        monkeypatch.syspath_prepend(str(folder))
+        modules.append(module)
+        return folder
+
+    yield install
+    for module in modules:
+        sys.modules.pop(module, None)
 
 
 @pytest.fixture(scope="session")

@@ -7,33 +7,24 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from envs.environment import EnvironmentFailure
 from trainers.calibration import calibrate
-from trainers.common.errors import UserError
+from trainers.common.command import DONE, tells_failures
 from trainers.evaluate import positive, seed_number
-from trainers.experience.env_runner import NonFiniteError
 from trainers.inference.confidence import NEVER, Card, Measured
-from trainers.learn import DONE, FAILED, MISTAKE
 
 EPISODES = 80_000
 
 
+@tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Calibrates a policy; returns the exit code."""
     options = parse(arguments)
-    try:
-        path, card = calibrate(
-            options.policy,
-            episodes=options.episodes,
-            seed=options.seed,
-            results_dir=options.results_dir,
-        )
-    except UserError as mistake:
-        print(f"error: {mistake}", file=sys.stderr)
-        return MISTAKE
-    except (NonFiniteError, EnvironmentFailure) as failure:
-        print(f"error: {failure}", file=sys.stderr)
-        return FAILED
+    path, card = calibrate(
+        options.policy,
+        episodes=options.episodes,
+        seed=options.seed,
+        results_dir=options.results_dir,
+    )
     print(f"{path}: {card.episodes} episodes, seed {card.seed}")
     print("\n".join(told(card)))
     return DONE

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from trainers.common.command import DONE, FAILED, tells_failures
 from trainers.common.errors import UserError
 from trainers.comparison.jobs import CORES, Job, run_missing
 from trainers.comparison.report import Experiments, write_report
 from trainers.comparison.results import RunResult, read_run, read_status
-from trainers.learn import DONE, FAILED, MISTAKE
 from trainers.runfile.changes import differences
 from trainers.runfile.registry import Registries, load_registries
 from trainers.runfile.settings import dump_yaml, load_run
@@ -63,24 +63,21 @@ class PlannedRun:
         return Job(self.folder.name, [learn], self.folder, done)
 
 
+@tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs what is missing and reports on all; returns the exit code."""
     options = parse_options(arguments)
+    _require_matplotlib()
+    made = [path for path in options.paths if (path / CONFIGURATION).is_file()]
+    planned = list(plan(options, [path for path in options.paths if path not in made]))
+    registries = load_registries()
+    # All run files are looked at before the first run begins.
+    jobs = [run.job(registries) for run in planned]
     try:
-        _require_matplotlib()
-        made = [path for path in options.paths if (path / CONFIGURATION).is_file()]
-        planned = list(plan(options, [path for path in options.paths if path not in made]))
-        registries = load_registries()
-        # All run files are looked at before the first run begins.
-        jobs = [run.job(registries) for run in planned]
         code = run_missing(jobs, options.jobs)
         page = write_report(collect(planned, made), options.report or options.results_dir)
-    except UserError as mistake:
-        print(f"error: {mistake}", file=sys.stderr)
-        return MISTAKE
     except OSError as error:
-        print(f"error: {error.filename}: can't be written: {error.strerror}", file=sys.stderr)
-        return MISTAKE
+        raise UserError(f"{error.filename}: can't be written: {error.strerror}") from error
     print(page)
     return FAILED if code else DONE
 

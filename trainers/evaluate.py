@@ -13,41 +13,33 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from envs.environment import EnvironmentFailure
 from envs.evaluation import EvaluationOption, Figure, RunFileOption
+from trainers.common.command import DONE, tells_failures
 from trainers.common.errors import UserError, suggestion
 from trainers.common.files import write_atomically
 from trainers.evaluation import SEED_LIMIT, Evaluation, evaluate, find_run
-from trainers.experience.env_runner import NonFiniteError
-from trainers.learn import DONE, FAILED, MISTAKE
 from trainers.reporting.figures import figure_values
 from trainers.runfile.settings import Component
 
 PROGRAM = "python -m trainers.evaluate"
 
 
+@tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluates a policy; returns the exit code."""
-    try:
-        options = parse(sys.argv[1:] if arguments is None else arguments)
-        evaluation = evaluate(
-            options.policy,
-            episodes=options.episodes,
-            seed=options.seed,
-            overrides=options.overrides,
-            results_dir=options.results_dir,
-            check=options.check,
-            window=options.window,
-            render=options.render,
-        )
-        if options.json is not None:
-            _write(options.json, evaluation.report)
-    except UserError as mistake:
-        print(f"error: {mistake}", file=sys.stderr)
-        return MISTAKE
-    except (NonFiniteError, EnvironmentFailure) as failure:
-        print(f"error: {failure}", file=sys.stderr)
-        return FAILED
+    options = parse(sys.argv[1:] if arguments is None else arguments)
+    evaluation = evaluate(
+        options.policy,
+        episodes=options.episodes,
+        seed=options.seed,
+        overrides=options.overrides,
+        results_dir=options.results_dir,
+        check=options.check,
+        window=options.window,
+        render=options.render,
+    )
+    if options.json is not None:
+        _write(options.json, evaluation.report)
     Console().print(table(options.policy, evaluation))
     return DONE
 

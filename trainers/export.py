@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from envs.environment import EnvironmentFailure
+from trainers.common.command import DONE, tells_failures
 from trainers.common.errors import UserError, first_lines
 from trainers.common.files import write_atomically
 from trainers.evaluation import FIRST_SEED, evaluation_environment, find_run
@@ -31,7 +32,6 @@ from trainers.inference.onnx_policy import OnnxPolicy, is_onnx
 from trainers.inference.policy import complete_metadata
 from trainers.inference.raw_policy import Arrays, RawPolicy
 from trainers.inference.real_camera import add_camera_options, read_camera
-from trainers.learn import DONE, MISTAKE
 from trainers.saving.checkpoint import MANIFEST, WEIGHTS, Loaded, weights_manifest
 from trainers.saving.run_folder import CHECKPOINTS, CONFIGURATION, find_checkpoint, run_folder
 
@@ -41,21 +41,16 @@ CHECKED = 100
 """Observations that a file is checked on."""
 
 
+@tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exports a policy; returns the exit code."""
     options = parse(arguments)
-    try:
-        if options.format == ONNX or is_onnx(options.folder):
-            print("\n".join(export_onnx(options)))
-        else:
-            _refuse_camera(options)
-            written = export(
-                options.policy, options.folder, options.results_dir, force=options.force
-            )
-            print(f"{options.folder}: {', '.join(written)}")
-    except UserError as mistake:
-        print(f"error: {mistake}", file=sys.stderr)
-        return MISTAKE
+    if options.format == ONNX or is_onnx(options.folder):
+        print("\n".join(export_onnx(options)))
+    else:
+        _refuse_camera(options)
+        written = export(options.policy, options.folder, options.results_dir, force=options.force)
+        print(f"{options.folder}: {', '.join(written)}")
     return DONE
 
 

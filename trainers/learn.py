@@ -12,33 +12,26 @@ from pathlib import Path
 from types import FrameType
 
 from trainers.common import process
+from trainers.common.command import DONE, INTERRUPTED, TERMINATED, tells_failures
+from trainers.common.errors import UserError
+from trainers.common.origin import PACKAGES
 
-DONE, FAILED, MISTAKE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
-PACKAGES = ("trainers", "envs", "encoders", "rewards", "curricula")
 
-
+@tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains as the run file says; returns the exit code."""
     options = parse(arguments)
     if shadowed := shadowed_packages():
-        print(f"error: {shadowed}", file=sys.stderr)
-        return MISTAKE
+        raise UserError(shadowed)
     process.prepare()
     # Imported late, so that `--help` and a mistyped option answer at once.
-    from envs.environment import EnvironmentFailure  # noqa: PLC0415
-    from trainers.common.errors import UserError  # noqa: PLC0415
-    from trainers.experience.env_runner import NonFiniteError  # noqa: PLC0415
     from trainers.run import run_file  # noqa: PLC0415
 
     with stop_on_signals() as stop:
         try:
             finished = run_file(options, stop.requested)
-        except UserError as mistake:
-            print(f"error: {mistake}", file=sys.stderr)
-            return MISTAKE
-        except (NonFiniteError, EnvironmentFailure) as failure:
-            print(f"error: {failure}", file=sys.stderr)
-            return FAILED
+        except KeyboardInterrupt:
+            return stop.exit_code
     return DONE if finished else stop.exit_code
 
 
@@ -85,17 +78,24 @@ class Stop:
         return self.exit_code != DONE
 
     def __call__(self, number: int, _frame: FrameType | None) -> None:
-        """Handles a signal: the first asks to stop, the second insists."""
+        """Handles a signal: the first asks to stop, the second insists.
+
+        Raises:
+            KeyboardInterrupt: it is the second.
+        """
         if self.requested():
-            raise SystemExit(self.exit_code)
+            raise KeyboardInterrupt
         self.exit_code = INTERRUPTED if number == signal.SIGINT else TERMINATED
 
 
 @contextmanager
 def stop_on_signals() -> Iterator[Stop]:
-    """Turns Ctrl-C and SIGTERM into a request to stop and save."""
+    """Turns Ctrl-C, SIGTERM and the end of the terminal into a request to stop and save."""
     stop = Stop()
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as it is under nohup
+        numbers.append(signal.SIGHUP)
+    before = {number: signal.signal(number, stop) for number in numbers}
     try:
         yield stop
     finally:

@@ -18,6 +18,7 @@ from encoders.raw_inputs import RawInput
 from envs.deployment import Meaning
 from envs.drawing import annotated
 from envs.views import View
+from trainers.common.command import DONE, tells_failures
 from trainers.common.errors import UserError
 from trainers.common.files import write_atomically
 from trainers.inference.confidence import Card
@@ -33,7 +34,6 @@ from trainers.inference.raw_policy import (
     Arrays,
 )
 from trainers.inference.real_camera import add_camera_options, read_camera
-from trainers.learn import DONE, MISTAKE
 
 PICTURE = ".png"
 INNER_OUTPUTS = (NEXT_HIDDEN_STATE, UNBOUNDED_ACTION)
@@ -104,14 +104,11 @@ def _named(names: Sequence[str], values: NDArray[Any]) -> dict[str, float]:
     return dict(zip(names, values.tolist(), strict=True))
 
 
+@tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Predicts; returns the exit code."""
     options = parse(arguments)
-    try:
-        predictions = predict(options)
-    except UserError as mistake:
-        print(f"error: {mistake}", file=sys.stderr)
-        return MISTAKE
+    predictions = predict(options)
     if options.json:
         print(json.dumps([one.plain() for one in predictions], indent=2))
     else:

@@ -15,17 +15,18 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.command import ROOT, add_options, require, tells_mistakes
+from benchmarks.command import ROOT, add_options, require
 from benchmarks.learning.cases import CASES, PLUGINS, SIDES, Entry
 from benchmarks.learning.report import HEAD, draw, rows
 from benchmarks.tables import table, write_between
+from trainers.common.command import tells_failures
 from trainers.common.errors import UserError
 from trainers.comparison.jobs import Job, run_missing
 from trainers.comparison.tables import markdown
 from trainers.runfile.registry import load_registries
 
 
-@tells_mistakes
+@tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains what is missing, and reports on all."""
     options = parse(arguments)

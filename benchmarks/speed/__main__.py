@@ -18,8 +18,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.command import INSTALL, missing, require, tells_mistakes
+from benchmarks.command import INSTALL, missing, require
 from trainers.common import process
+from trainers.common.command import tells_failures
 
 PARTS = ("simulator", "environment", "training", "memory")
 SIZES = (32, 80, 128, 256)
@@ -27,7 +28,7 @@ SIZES = (32, 80, 128, 256)
 MIN_ENVS = 16
 
 
-@tells_mistakes
+@tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, and prints tables or tracks a history."""
     options = parse(arguments)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from benchmarks import ablation
-from trainers.learn import MISTAKE
+from trainers.common.command import MISTAKE
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import load_run
 

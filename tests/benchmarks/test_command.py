@@ -1,4 +1,4 @@
-"""Mistakes and missing extras are told without tracebacks."""
+"""Missing extras are told without tracebacks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from benchmarks.command import missing, require, tells_mistakes
+from benchmarks.command import missing, require
 from trainers.common.errors import UserError
 
 INSTALL = "pip install -c constraints.txt -e '.[bench]'"
@@ -19,20 +19,6 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
         require("json", "scipy")
     assert INSTALL in str(caught.value)
     require("json")
-
-
-def test_a_mistake_is_told_and_a_failure_is_not_hidden(capsys: pytest.CaptureFixture[str]) -> None:
-    @tells_mistakes
-    def command(error: Exception | None) -> int:
-        if error is not None:
-            raise error
-        return 7
-
-    assert command(None) == 7
-    assert command(UserError("the way out")) == 2
-    assert capsys.readouterr().err == "error: the way out\n"
-    with pytest.raises(KeyError):
-        command(KeyError("a bug"))
 
 
 @pytest.mark.parametrize(

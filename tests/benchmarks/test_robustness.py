@@ -11,8 +11,8 @@ import pytest
 from benchmarks import robustness
 from envs.grasp.sensors.structured_light import StructuredLight
 from envs.grasp.settings import Camera, GraspSettings
+from trainers.common.command import DONE, MISTAKE
 from trainers.evaluation import Evaluation
-from trainers.learn import DONE, MISTAKE
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import load_run
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from rewards.reward import RewardTerm, fits, fitting, weigh
+from rewards.reward import RewardError, RewardTerm, fits, fitting, weigh
 
 
 @dataclass(frozen=True)
@@ -79,5 +79,12 @@ def test_terms_are_weighed_by_name() -> None:
 @pytest.mark.parametrize("shape", [(), (3,), (2, 1)])
 def test_anything_but_a_number_for_each_environment_is_refused(shape: tuple[int, ...]) -> None:
     term = RewardTerm("odd", 1.0, lambda snapshot: np.zeros(shape))
-    with pytest.raises(ValueError, match=r"'odd' returned .* for 2 environments: .* \(2,\)$"):
+    with pytest.raises(RewardError, match=r"'odd' returned .* for 2 environments: .* \(2,\)$"):
+        weigh([term], None, 2)
+
+
+@pytest.mark.parametrize("returned", [["much", "little"], [[1.0], [1.0, 2.0]], [None, object()]])
+def test_what_is_no_number_is_refused(returned: Any) -> None:
+    term = RewardTerm("odd", 1.0, lambda snapshot: returned)
+    with pytest.raises(RewardError, match=r"'odd' returned no numbers: .* \(2,\)$"):
         weigh([term], None, 2)

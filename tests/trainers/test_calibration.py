@@ -16,6 +16,7 @@ from envs.evaluation import Evaluator
 from trainers import calibration
 from trainers.calibrate import main
 from trainers.calibration import FIRST_SEED
+from trainers.common.command import DONE, MISTAKE
 from trainers.common.errors import UserError
 from trainers.evaluation import FIRST_SEED as FIRST_EVALUATED
 from trainers.evaluation import (
@@ -32,7 +33,6 @@ from trainers.inference.confidence_fit import Examples
 from trainers.inference.fitting import load_raw_policy
 from trainers.inference.onnx_policy import OnnxPolicy
 from trainers.inference.policy import Policy
-from trainers.learn import DONE, MISTAKE
 from trainers.networks.actor_critic import ActorCritic
 from trainers.reporting.figures import SURE, SURE_RIGHT
 from trainers.runfile.registry import Registries

@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from trainers import compare
+from trainers.common.command import DONE, MISTAKE
 from trainers.compare import main
-from trainers.learn import DONE, MISTAKE
 from trainers.runfile.registry import load_registries
 from trainers.saving.run_folder import CONFIGURATION
 

@@ -17,9 +17,8 @@ from envs.environment import EnvironmentFailure
 from envs.evaluation import PhysicalCheckOption
 from envs.grasp.evaluation.report import GraspReport
 from trainers import evaluation
-from trainers.common.errors import UserError
+from trainers.common.errors import NonFiniteError, UserError
 from trainers.evaluate import main
-from trainers.experience.env_runner import NonFiniteError
 from trainers.runfile.registry import Registries
 from trainers.saving.evaluation_folder import REPORT, EvaluationFolder
 from trainers.saving.run_folder import find_checkpoint

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from trainers import evaluation
+from trainers.common.command import DONE, MISTAKE
 from trainers.evaluation import evaluate
 from trainers.export import main
-from trainers.learn import DONE, MISTAKE
 
 
 @pytest.fixture

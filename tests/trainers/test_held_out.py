@@ -15,9 +15,9 @@ from pydantic import BaseModel
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor, nn
 
+from trainers.common.command import DONE, MISTAKE
 from trainers.experience.env_runner import StopRequested
 from trainers.held_out import HeldOutEvaluation
-from trainers.learn import DONE, MISTAKE
 from trainers.runfile.settings import Component, RunSettings
 from trainers.saving.checkpoint import Checkpoints
 from trainers.session import Session

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import yaml
 
+from trainers.common.command import DONE, MISTAKE
 from trainers.evaluation import evaluation_environment, find_run
 from trainers.inference.policy import Policy
-from trainers.learn import DONE, MISTAKE
 from trainers.predict import main
 
 SHIPPED = Path(__file__).parents[2] / "policies" / "grasp_gaussian"

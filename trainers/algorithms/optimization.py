@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from trainers.experience.env_runner import NonFiniteError
+from trainers.common.errors import NonFiniteError
 
 
 def optimizer_step(

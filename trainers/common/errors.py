@@ -10,6 +10,17 @@ class UserError(Exception):
     """The user's mistake: the message names it and the way out, and no traceback is shown."""
 
 
+class Failure(Exception):  # noqa: N818 - Error would say that something is wrong with ventosa
+    """Why a command can't go on, through no mistake of the user's and none of ventosa's.
+
+    The message says it all, and no traceback is shown.
+    """
+
+
+class NonFiniteError(Failure):
+    """NaN or infinity where learning can't go on; the message names what, where and when."""
+
+
 def suggestion(name: str, known: Iterable[str]) -> str:
     """Say which known name is meant, or which ones there are."""
     names = sorted(known)

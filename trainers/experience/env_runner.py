@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,16 +12,13 @@ from numpy.typing import NDArray
 
 from curricula.samplers import ParameterValue
 from envs.environment import Environment, EnvironmentFailure
+from trainers.common.errors import NonFiniteError
 from trainers.common.timers import timed
 from trainers.experience.episodes import Cohorts, EpisodeBatch
 
 
 class StopRequested(Exception):  # noqa: N818 - nothing went wrong
     """The user asked the run to stop."""
-
-
-class NonFiniteError(FloatingPointError):
-    """NaN or infinity where learning can't go on; the message names what, where and when."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ class EnvRunner:
 
     Args:
         env: the environments.
-        stop_requested: asked before every step.
+        stop_requested: asked before every step, and in updates.
 
     Attributes:
         observations: the present ones, as the environment gave them.
@@ -114,8 +112,7 @@ class EnvRunner:
             NonFiniteError: a reward or an observation is NaN or infinite.
             EnvironmentFailure: an episode was truncated, and its last observation is not there.
         """
-        if self._stop_requested():
-            raise StopRequested
+        self.check_stop()
         with timed("environment"):
             observations, reward, terminated, truncated, infos = self.env.step(actions)
         self.step_count += self.env.num_envs
@@ -137,6 +134,24 @@ class EnvRunner:
         self._add_up(reward, terms, infos.get("episode_metrics", {}), done)
         self.observations = observations
         return step
+
+    def check_stop(self) -> None:
+        """Lets the run stop here: before each step, and in an update before each optimizer step.
+
+        Raises:
+            StopRequested: it is to stop.
+        """
+        if self._stop_requested():
+            raise StopRequested
+
+    @contextmanager
+    def unstoppable(self) -> Iterator[None]:
+        """Hears no request to stop meanwhile."""
+        asked, self._stop_requested = self._stop_requested, lambda: False
+        try:
+            yield
+        finally:
+            self._stop_requested = asked
 
     @property
     def longest_episode(self) -> int:

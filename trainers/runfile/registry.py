@@ -21,6 +21,7 @@ from torch import nn
 from envs.environment import Environment
 from trainers import hookspecs
 from trainers.common.errors import UserError, suggestion
+from trainers.common.origin import Origin, origin_of
 from trainers.common.trainer_settings import TrainerSettings
 
 BUILT_IN = "built-in"
@@ -40,19 +41,6 @@ CURRICULUM_METHODS = (
     "final_parameters",
 )
 TRAINER_METHODS = ("build_policy", "collect", "update", "state_dict", "load_state_dict")
-
-
-@dataclass(frozen=True)
-class Origin:
-    """Origin of a component: the plugin, and the distribution that brought it."""
-
-    plugin: str
-    """The module of a built-in plugin, or the name of the entry point."""
-    distribution: str
-    """`name version` of the installed distribution, or `built-in`."""
-
-    def __str__(self) -> str:
-        return f"plugin '{self.plugin}' ({self.distribution})"
 
 
 class PluginError(UserError):
@@ -153,8 +141,7 @@ def plugin_manager(built_in: Iterable[str | object] = BUILT_IN_PLUGINS) -> Plugi
             name = getattr(plugin, "__name__", type(plugin).__name__)
             manager.add(plugin, Origin(name, BUILT_IN))
     for point in importlib.metadata.entry_points(group=hookspecs.PROJECT_NAME):
-        brought_by = f"{point.dist.name} {point.dist.version}" if point.dist else "unknown"
-        origin = Origin(point.name, brought_by)
+        origin = origin_of(point)
         manager.add(imported(point.load, origin), origin)
     return manager
 

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.environment import EnvironmentFailure
 from envs.grasp.batch import Batch
 from envs.grasp.scene import surroundings
 from envs.grasp.scene.dark import draw_dark
@@ -21,7 +22,7 @@ from envs.grasp.simulators.thread_pool import ThreadPool
 Floats = NDArray[np.float64]
 
 
-class SceneError(ValueError):
+class SceneError(EnvironmentFailure, ValueError):
     """The ranges of the run file leave no room for a scene."""
 
 

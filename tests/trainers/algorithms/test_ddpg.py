@@ -17,8 +17,8 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from trainers.algorithms.ddpg import DDPG, DDPGHyperparameters, DDPGSettings
-from trainers.common.errors import UserError
-from trainers.experience.env_runner import EnvRunner, NonFiniteError
+from trainers.common.errors import NonFiniteError, UserError
+from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import concatenate
 from trainers.inference.policy import Policy
 from trainers.networks.deterministic import DeterministicPolicy, DeterministicSettings

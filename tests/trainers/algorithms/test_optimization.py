@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from trainers.algorithms.optimization import optimizer_step
-from trainers.experience.env_runner import NonFiniteError
+from trainers.common.errors import NonFiniteError
 
 INFINITE = float("inf")
 

@@ -25,8 +25,8 @@ from trainers.algorithms.ppo import (
     clipped_value_loss,
     surrogate_loss,
 )
-from trainers.common.errors import UserError
-from trainers.experience.env_runner import EnvRunner, NonFiniteError
+from trainers.common.errors import NonFiniteError, UserError
+from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import concatenate
 from trainers.inference.policy import Policy
 from trainers.networks.distributions import Categorical, DiagonalGaussian

@@ -30,7 +30,8 @@ from trainers.algorithms.trpo import (
     line_search,
     surrogate_gain,
 )
-from trainers.experience.env_runner import EnvRunner, NonFiniteError
+from trainers.common.errors import NonFiniteError
+from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import concatenate
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Categorical, DiagonalGaussian, Distribution

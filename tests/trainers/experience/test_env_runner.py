@@ -12,12 +12,8 @@ from gymnasium.spaces import Box
 
 from encoders.spaces import RgbImage
 from envs.environment import EnvironmentFailure
-from trainers.experience.env_runner import (
-    EnvRunner,
-    NonFiniteError,
-    Step,
-    StopRequested,
-)
+from trainers.common.errors import NonFiniteError
+from trainers.experience.env_runner import EnvRunner, Step, StopRequested
 
 SPACE = gymnasium.spaces.Dict({"x": Box(-np.inf, np.inf, (1,), np.float32), "eye": RgbImage(2, 2)})
 ACTIONS = np.zeros((2, 1))

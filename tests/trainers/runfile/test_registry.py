@@ -474,7 +474,7 @@ def test_the_command_tells_a_plugins_failure(
 
     monkeypatch.setattr(command, "load_registries", fail)
     assert command.main([]) == 2
-    assert capsys.readouterr().err == "plugin 'mine' (their-dist 2.5): is broken\n"
+    assert capsys.readouterr().err == "error: plugin 'mine' (their-dist 2.5): is broken\n"
 
 
 def test_the_hook_specifications_import_pluggy_alone() -> None:
