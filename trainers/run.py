@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from envs.environment import EnvironmentFailure
 from trainers.algorithms.base import TrainerSettings
+from trainers.common.command import told
 from trainers.common.errors import UserError, first_lines
 from trainers.common.files import write_atomically
+from trainers.common.origin import blaming_plugins
 from trainers.common.timers import Timer, recording
-from trainers.experience.env_runner import NonFiniteError, StopRequested
+from trainers.experience.env_runner import StopRequested
 from trainers.held_out import HeldOutEvaluation
 from trainers.inference.metadata import FILE as METADATA
 from trainers.reporting.event_log import RunLog
@@ -36,6 +39,8 @@ from trainers.training import Ending, Training
 
 TIMERS = "timers.json"
 
+_logger = logging.getLogger("ventosa")
+
 
 def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) -> bool:
     """Does what the command line asks for.
@@ -49,7 +54,7 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
 
     Raises:
         UserError: the user's mistake.
-        NonFiniteError, EnvironmentFailure: the run can't go on.
+        Exception: the run can't go on; a note names its last checkpoint.
     """
     registries = load_registries()
     run = load_run(options.config, options.overrides + _flags(options), registries)
@@ -106,7 +111,10 @@ def _timers_written(directory: Path) -> Iterator[None]:
         with recording(root):
             yield
     finally:
-        write_atomically(directory / TIMERS, json.dumps(root.tree(), indent=2) + "\n")
+        try:
+            write_atomically(directory / TIMERS, json.dumps(root.tree(), indent=2) + "\n")
+        except OSError as error:
+            _logger.warning("%s", error)
 
 
 @contextmanager
@@ -133,16 +141,18 @@ def _train(
     """Trains, and leaves the run's state in status.json however it ends."""
     state, reason = "failed", None
     try:
-        ending = training.run()
+        with blaming_plugins():
+            ending = training.run()
         state, reason = "finished" if ending.finished else "interrupted", ending.reason
         if not ending.finished:
             display.message("stopped and saved; go on with --resume")
         return ending
-    except NonFiniteError as error:
-        reason = f"{error}; {_last_good(checkpoints)}"
-        raise NonFiniteError(reason) from error
-    except BaseException as error:
-        reason = f"{type(error).__name__}: {error}"
+    except KeyboardInterrupt:
+        state, reason = "interrupted", f"stopped at once; {_last_good(checkpoints)}"
+        raise
+    except Exception as error:
+        error.add_note(_last_good(checkpoints))
+        reason = told(error)
         raise
     finally:
         saved = checkpoints.list_checkpoints()

@@ -28,6 +28,7 @@ from trainers.networks.factory import NetworkFactory
 from trainers.reporting.summary import RunPosition
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import Component, RunSettings
+from trainers.saving.resumable import ALGORITHM, Resumable
 
 _logger = logging.getLogger("ventosa")
 
@@ -127,21 +128,28 @@ class Session:
         self.env_runner.set_parameters(self._parameters_now())
         return True
 
+    def resumable(self) -> Resumable:
+        """What it can be taken up from; taken between an update and the next collection.
+
+        It may share memory with what updates change: it is of use until the next one.
+        """
+        return Resumable(self.env_runner.step_count, self.weights(), self.state_dict())
+
     def weights(self) -> dict[str, Tensor]:
         """The policy's weights."""
         return dict(self.algorithm.policy.state_dict())
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything but the weights; taken between an update and the next collection."""
+        """Everything but the weights; see `resumable`."""
         return {
-            "algorithm": self.algorithm.state_dict(),
+            ALGORITHM: self.algorithm.state_dict(),
             "interaction": self.env_runner.state_dict(),  # checkpoints have always called it so
             "curriculum": self._curriculum_state,
         }
 
     def load_state_dict(self, weights: dict[str, Tensor], state: Mapping[str, Any]) -> None:
         """Goes back to a state."""
-        self.algorithm.load_state_dict(weights, state["algorithm"])
+        self.algorithm.load_state_dict(weights, state[ALGORITHM])
         if self.curriculum is not None:
             self._curriculum_state = state["curriculum"]
         self.env_runner.set_parameters(self._parameters_now())

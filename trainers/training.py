@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any
 
-from envs.environment import EnvironmentFailure
+from torch import Tensor
+
 from trainers.algorithms.base import TrainerSettings
 from trainers.common.averager import Averager
+from trainers.common.errors import NonFiniteError
 from trainers.common.timers import timed
 from trainers.experience.env_runner import StopRequested
 from trainers.held_out import HeldOutEvaluation
@@ -17,6 +18,7 @@ from trainers.reporting.event_log import RunLog
 from trainers.reporting.summary import Summary
 from trainers.reporting.terminal import TerminalDisplay
 from trainers.saving.checkpoint import Checkpoints, Loaded
+from trainers.saving.resumable import Resumable
 from trainers.session import Session
 
 REWARD, AGE = "reward", "age"
@@ -77,13 +79,16 @@ class Training:
             if SCORING in resumed.state:  # not in those of former versions
                 self._since_save.load_state_dict(resumed.state[SCORING])
         self._told_of_endless = False
+        self._finite = _finite(session.weights())  # a buffer of infinities may be meant
 
     def run(self) -> Ending:
-        """Trains until there is reason to end; what was learned is saved.
+        """Trains until there is reason to end; what was learned is saved, however it ends.
 
         Raises:
-            EnvironmentFailure: an environment broke down; the run is saved as of the last update.
-            NonFiniteError: a reward, an observation or a loss is not finite; nothing new is saved.
+            NonFiniteError: a reward, an observation, a loss or a weight is not finite.
+            Exception, SystemExit: whatever an environment or another part raises. The run is saved
+                as it was after the last whole update, as after a `NonFiniteError`; a note says so
+                where it could not be.
         """
         try:
             return self._run()
@@ -93,41 +98,64 @@ class Training:
     def _run(self) -> Ending:
         env_runner, max_steps = self._session.env_runner, self._settings.max_steps
         interval = self._settings.checkpoint_interval
+        # Between an update and the next collection is where a run can be taken up again.
+        present = self._session.resumable()
         if self._saved_step is not None:
-            self._save(env_runner.step_count)  # its evaluation was cut off, and is made up for
+            self._save(present)  # its evaluation was cut off, and is made up for
         while env_runner.step_count < max_steps:
-            step = env_runner.step_count
-            # Between an update and the next collection is where a run can be taken up again. It may
-            # share memory with what updates change: the state is of use until the next one.
-            with self._saved_if_cut_off(step, self._session.state_dict()), timed("collect"):
-                self._session.algorithm.collect()
-            self._update(step / max_steps)
-            before, step = step, env_runner.step_count
-            with self._saved_if_cut_off(step):
+            before = present
+            with self._saved_if_cut_off(before):
+                with timed("collect"):
+                    self._session.algorithm.collect()
+                copy = before.copied()
+            self._update(copy, before.step / max_steps)
+            present = self._session.resumable()
+            step = present.step
+            with self._saved_if_cut_off(present):
                 evaluated = self._evaluate(step)
-            if evaluated or step // interval > before // interval:
-                self._save(step, interval_over=True)
+            if evaluated or step // interval > before.step // interval:
+                self._save(present, interval_over=True)
             if evaluated and self._held_out and (reached := self._held_out.target_reached):
                 return Ending(True, reached)
-        self._save(env_runner.step_count)
+        self._save(present)
         return Ending(True, f"max_steps: {max_steps} steps were taken")
 
     @contextmanager
-    def _saved_if_cut_off(self, step: int, state: dict[str, Any] | None = None) -> Iterator[None]:
-        """Saves the run where it is stopped, or an environment breaks down.
+    def _saved_if_cut_off(self, good: Resumable | None) -> Iterator[None]:
+        """Saves the run where it is stopped, or anything in it fails.
 
         Args:
-            step: that of the state.
-            state: what to go on from; None: what the session then has.
+            good: what to go on from; None: there is nothing but the last checkpoint.
         """
         try:
             yield
-        except (StopRequested, EnvironmentFailure):
-            self._save(step, state)
+        except StopRequested:
+            assert good is not None  # or nothing could be stopped
+            self._save(good)
+            raise
+        except (Exception, SystemExit) as error:
+            if good is not None:
+                self._save_after(error, good)
             raise
 
-    def _update(self, run_fraction: float) -> None:
-        """Learns from what was collected, and tells what came of it."""
+    def _save_after(self, error: BaseException, good: Resumable) -> None:
+        """Saves the run; why it can't be is noted, and does not hide what it failed of."""
+        try:
+            self._save(good)
+        except Exception as unsaved:
+            error.add_note(f"the run could not be saved: {unsaved}")
+
+    def _update(self, before: Resumable | None, run_fraction: float) -> None:
+        """Learns from what was collected; cut off half way, it leaves the run as it was before.
+
+        Without a copy of that it is not stopped half way.
+        """
+        deaf = self._session.env_runner.unstoppable() if before is None else nullcontext()
+        with self._saved_if_cut_off(before), deaf:
+            self._learn(run_fraction)
+
+    def _learn(self, run_fraction: float) -> None:
+        """Updates, and tells what came of it."""
         session, summary = self._session, self._summary
         self._tell_of_endless()
         with timed("update"):
@@ -135,13 +163,14 @@ class Training:
         env_runner = session.env_runner
         episodes = env_runner.pop_finished()
         summary.add_episodes(episodes)
-        if len(episodes):
-            self._since_save.add({REWARD: float(episodes.rewards.mean())}, len(episodes))
         if session.advance_curriculum(episodes, env_runner.step_count / self._settings.max_steps):
             begins = f"step {env_runner.step_count}: {session.lesson_title} begins"
             self._display.message(begins)
         with timed("summary"):
             summary.report(session.position, env_runner.observations, self._display)
+        # Last, as it is part of what is saved where anything above fails.
+        if len(episodes):
+            self._since_save.add({REWARD: float(episodes.rewards.mean())}, len(episodes))
 
     def _tell_of_endless(self) -> None:
         """Says once that an episode seems to have no end, which keeps all figures waiting."""
@@ -172,20 +201,23 @@ class Training:
         self._summary.note_evaluation(held_out.latest)
         return True
 
-    def _save(
-        self, step: int, state: dict[str, Any] | None = None, *, interval_over: bool = False
-    ) -> None:
-        """Saves the run, unless it is saved already with all that is known of it."""
+    def _save(self, good: Resumable, *, interval_over: bool = False) -> None:
+        """Saves the run, unless it is saved already with all that is known of it.
+
+        Raises:
+            NonFiniteError: weights are not finite that were; nothing is saved.
+        """
+        step = good.step
         score, score_of = self._score(step)
         if step == self._saved_step and (score is None or self._saved_score is not None):
             return
+        if broken := self._finite - _finite(good.weights):
+            raise NonFiniteError(f"step {step}: the weights {min(broken)!r} are not finite")
         if interval_over:
             self._since_save = Averager()
         with timed("checkpoint"):
-            scoring = self._since_save.state_dict()
-            state = {"step": step, SCORING: scoring, **(state or self._session.state_dict())}
-            weights = self._session.weights()
-            path = self._checkpoints.save(step, weights, state, score, score_of)
+            state = {"step": step, SCORING: self._since_save.state_dict(), **good.state}
+            path = self._checkpoints.save(step, good.weights, state, score, score_of)
         self._saved_step, self._saved_score = step, score
         self._summary.note_checkpoint(path)
 
@@ -201,3 +233,8 @@ class Training:
             return self._held_out.score if is_of_this else None, score_of
         reward = self._since_save.means().get(REWARD)
         return (reward, REWARD) if self._session.lesson_count == 1 else (None, AGE)
+
+
+def _finite(weights: Mapping[str, Tensor]) -> set[str]:
+    """Names of those that are finite."""
+    return {name for name, values in weights.items() if values.isfinite().all()}

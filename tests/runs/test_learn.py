@@ -552,7 +552,10 @@ def tiny_grasp(write_run: WriteRun, **environment: Any) -> Path:
 
 @pytest.mark.parametrize(
     ("good_calls", "step", "last"),
-    [(9, 40, "the last good checkpoint is {}/step-32"), (1, 8, "no checkpoint was saved yet")],
+    [
+        (9, 40, "the last good checkpoint is {}/step-32"),
+        (1, 8, "the last good checkpoint is {}/step-0"),
+    ],
 )
 def test_a_reward_that_breaks_ends_the_run_with_its_name_and_the_way_back(
     learn: Learn, write_run: WriteRun, good_calls: int, step: int, last: str

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import itertools
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,10 +15,12 @@ import torch
 
 from envs.environment import EnvironmentFailure
 from trainers import training as training_module
-from trainers.experience.env_runner import NonFiniteError, StopRequested
+from trainers.common.errors import NonFiniteError
+from trainers.experience.env_runner import StopRequested
 from trainers.reporting.summary import Summary
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings
+from trainers.saving import resumable
 from trainers.saving.checkpoint import Checkpoints, Loaded
 from trainers.session import Session
 
@@ -73,7 +77,8 @@ class Training:
         folder: Path,
         stop_at_step: float = np.inf,
     ):
-        self.session = Session(run, registries, lambda: self.steps >= stop_at_step)
+        self.stop_at_step = stop_at_step
+        self.session = Session(run, registries, lambda: self.steps >= self.stop_at_step)
         self.settings: Any = run.trainer.settings
         self.checkpoints = Checkpoints(folder, keep=99)
         self.quiet = Quiet()
@@ -436,18 +441,184 @@ def test_an_evaluation_that_was_cut_off_scores_its_checkpoint_when_it_is_made_up
     assert again.checkpoints.load_latest().state["interaction"]["step_count"] == 32
 
 
-def test_a_breakdown_while_updating_saves_nothing(
+# -- every way out saves -------------------------------------------------------------------------
+
+SEPARATE = {"critic": "separate", "normalize": True}
+ALGORITHMS = {
+    "ppo": {"hyperparameters": {"num_epoch": 3}, "network_settings": SEPARATE},
+    "trpo": {"hyperparameters": {"num_epoch": 3}, "network_settings": SEPARATE},
+    "ddpg": {"hyperparameters": {"save_replay_buffer": True}, "network_settings": SEPARATE},
+}
+
+
+def cut_off(
+    one: Training,
+    monkeypatch: pytest.MonkeyPatch,
+    error: BaseException | None,
+    after_steps: int,
+    optimizer_steps: int,
+) -> None:
+    """Lets an update fail, or be asked to stop, after so many of its optimizer steps."""
+    algorithm: Any = one.session.algorithm
+    take, taken = algorithm._optimizer_step, itertools.count(1)
+
+    def step(*arguments: Any) -> None:
+        take(*arguments)
+        if one.steps > after_steps and next(taken) == optimizer_steps:
+            if error is not None:
+                raise error
+            one.stop_at_step = 0
+
+    monkeypatch.setattr(algorithm, "_optimizer_step", step)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "error"),
+    [
+        *itertools.product(ALGORITHMS, [None, MemoryError()]),
+        ("ppo", SystemExit(0)),
+        ("ppo", NonFiniteError("the loss is nan")),
+    ],
+    ids=repr,
+)
+def test_an_update_that_is_cut_off_leaves_the_run_as_it_was_before(
+    training: Callable[..., Training],
+    monkeypatch: pytest.MonkeyPatch,
+    algorithm: str,
+    error: BaseException | None,
+) -> None:
+    trainer = {
+        "trainer_type": algorithm,
+        "max_steps": 80,
+        "checkpoint_interval": 1000,
+        **ALGORITHMS[algorithm],
+    }
+    whole = training(trainer, folder="whole")
+    assert whole.train()
+    with monkeypatch.context() as patch:
+        first = training(trainer, folder="halves")
+        cut_off(first, patch, error, after_steps=48, optimizer_steps=5)
+        if error is None:
+            assert first.train() is False
+        else:
+            with pytest.raises(type(error)) as failed:
+                first.train()
+            assert failed.value is error
+            assert not getattr(error, "__notes__", [])
+    assert first.steps == 64  # all of the fourth collection was there
+    assert first.saved == [48]
+    second = training(trainer, folder="halves")
+    second.resume()
+    assert second.train()
+    expected, got = whole.checkpoints.load_latest(), second.checkpoints.load_latest()
+    for name, tensor in expected.weights.items():
+        assert torch.equal(tensor, got.weights[name]), name
+    np.testing.assert_equal(as_arrays(got.state), as_arrays(expected.state))
+
+
+def test_an_update_that_can_not_be_taken_back_is_not_stopped_and_its_failure_saves_nothing(
     training: Callable[..., Training], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one = training()
+    monkeypatch.setattr(resumable, "LEAST_BYTES", 0)  # now the replay buffer is a large one
+    trainer = {
+        "trainer_type": "ddpg",
+        "checkpoint_interval": 32,
+        **ALGORITHMS["ddpg"],
+    }
+    stopped = training(trainer, folder="stopped")
+    cut_off(stopped, monkeypatch, None, after_steps=32, optimizer_steps=1)
+    assert stopped.train() is False
+    assert stopped.saved == [32, 48]
+    failed = training(trainer, folder="failed")
+    cut_off(failed, monkeypatch, MemoryError(), after_steps=32, optimizer_steps=1)
+    with pytest.raises(MemoryError):
+        failed.train()
+    assert failed.saved == [32]
 
-    def update(_: float) -> Any:
-        raise EnvironmentFailure("nobody knows how")
 
-    monkeypatch.setattr(one.session.algorithm, "update", update)
-    with pytest.raises(EnvironmentFailure):
+@pytest.mark.parametrize("error", [ZeroDivisionError("a plugin's"), SystemExit(0)], ids=repr)
+@pytest.mark.parametrize("part", ["env_runner.env.step", "advance_curriculum", "report"])
+def test_whatever_fails_leaves_the_run_saved(
+    training: Callable[..., Training],
+    monkeypatch: pytest.MonkeyPatch,
+    part: str,
+    error: BaseException,
+) -> None:
+    one = training({"checkpoint_interval": 1000})
+    owner: Any = Summary if part == "report" else one.session
+    *path, name = part.split(".")
+    for attribute in path:
+        owner = getattr(owner, attribute)
+    call = getattr(owner, name)
+
+    def failing(*arguments: Any) -> Any:
+        if one.steps >= 40:
+            raise error
+        return call(*arguments)
+
+    monkeypatch.setattr(owner, name, failing)
+    with pytest.raises(type(error)):
+        one.train()
+    assert one.saved == [32]
+    assert one.checkpoints.load_latest().state["interaction"]["step_count"] == 32
+
+
+def test_what_failed_first_is_told_where_the_run_can_not_be_saved(
+    training: Callable[..., Training], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = training({"checkpoint_interval": 1000})
+    failure = EnvironmentFailure("a cable came loose")
+
+    def breakage(_: Any) -> Any:
+        raise failure
+
+    def full(*_: Any) -> None:
+        raise OSError("the disk is full")
+
+    breaking_after(one, 40, breakage)
+    monkeypatch.setattr(one.checkpoints, "save", full)
+    with pytest.raises(EnvironmentFailure) as failed:
+        one.train()
+    assert failed.value is failure
+    assert failure.__notes__ == ["the run could not be saved: the disk is full"]
+
+
+def test_the_second_signal_saves_nothing(training: Callable[..., Training]) -> None:
+    one = training({"checkpoint_interval": 1000})
+
+    def breakage(_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    breaking_after(one, 40, breakage)
+    with pytest.raises(KeyboardInterrupt):
         one.train()
     assert one.saved == []
+
+
+@pytest.mark.parametrize("interval", [16, 1000])
+def test_weights_that_are_not_finite_are_not_saved(
+    training: Callable[..., Training], monkeypatch: pytest.MonkeyPatch, interval: int
+) -> None:
+    one = training({"checkpoint_interval": interval})
+    algorithm: Any = one.session.algorithm
+    update = algorithm.update
+
+    def overflowing(run_fraction: float) -> Any:
+        statistics = update(run_fraction)
+        if one.steps == 32:
+            next(algorithm.policy.parameters()).data.fill_(np.inf)
+        return statistics
+
+    monkeypatch.setattr(algorithm, "update", overflowing)
+    with pytest.raises(NonFiniteError) as failed:
+        one.train()
+    if interval == 16:
+        assert re.fullmatch(r"step 32: the weights '.+' are not finite", str(failed.value))
+        assert one.saved == [16]
+    else:
+        (note,) = failed.value.__notes__
+        assert note.startswith("the run could not be saved: step 32: the weights '")
+        assert one.saved == []
 
 
 def test_a_new_lesson_is_announced(training: Callable[..., Training]) -> None:

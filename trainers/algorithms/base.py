@@ -58,13 +58,16 @@ class Algorithm(Protocol):
 
         Raises:
             NonFiniteError: a loss is NaN or infinite; the weights are as before that step.
+            StopRequested: `env_runner.check_stop`, which a long update should call now and then,
+                says that the run is to stop. What the update changed is taken back.
         """
 
     def state_dict(self) -> dict[str, Any]:
         """Everything but the weights that is needed to go on exactly.
 
         It may share memory with what `collect` leaves alone, such as optimizers and a replay
-        buffer: a state from before a collection is saved where that is stopped half way.
+        buffer: a state from before a collection is saved where that is stopped half way. It is
+        copied before an update, unless it is much larger than the weights.
         """
 
     def load_state_dict(self, weights: dict[str, Tensor], state: dict[str, Any]) -> None:

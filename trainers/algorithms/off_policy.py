@@ -259,8 +259,10 @@ class OffPolicyAlgorithm(ABC):
         """One step of the optimizer of that name, with clipped gradients.
 
         Raises:
+            StopRequested: the run is to stop; nothing was changed.
             NonFiniteError: the loss or its gradient is NaN or infinite; nothing was changed.
         """
+        self._env_runner.check_stop()
         optimizer_step(
             self._optimizers[name],
             loss,

@@ -145,8 +145,10 @@ class OnPolicyAlgorithm:
         """One step of gradient descent.
 
         Raises:
+            StopRequested: the run is to stop; nothing was changed.
             NonFiniteError: the loss or its gradient is NaN or infinite; nothing was changed.
         """
+        self._env_runner.check_stop()
         parameters = [p for group in self._optimizer.param_groups for p in group["params"]]
         step = self._env_runner.step_count
         optimizer_step(self._optimizer, loss, parameters, self._max_gradient_norm, step)

@@ -47,6 +47,25 @@ def flatten(state: Any) -> tuple[Any, dict[str, np.ndarray]]:
     return _flatten(state, "state", arrays), arrays
 
 
+def snapshot(state: Any, most_bytes: int) -> Any:
+    """Copy nested state, so that nothing changes it any more; its tensors are on the CPU.
+
+    Args:
+        state: as `flatten` takes it.
+        most_bytes: that its arrays may have.
+
+    Returns:
+        The copy; None where the arrays are larger.
+
+    Raises:
+        TypeError: see `flatten`.
+    """
+    skeleton, arrays = flatten(state)
+    if sum(array.nbytes for array in arrays.values()) > most_bytes:
+        return None
+    return unflatten(skeleton, {name: array.copy() for name, array in arrays.items()})
+
+
 def unflatten(skeleton: Any, arrays: dict[str, np.ndarray]) -> Any:  # noqa: PLR0911 one a kind
     """Put together what `flatten` took apart; the inverse of it.
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from trainers.saving.serialization import flatten, unflatten
+from trainers.saving.serialization import flatten, snapshot, unflatten
 
 TORCH_DTYPES = [
     *(torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.float8_e4m3fn),
@@ -190,6 +190,17 @@ class Color(IntEnum):
 def test_anything_else_is_refused_with_its_path(value: Any, path: str) -> None:
     with pytest.raises(TypeError, match=path):
         flatten(value)
+
+
+def test_a_snapshot_stays_as_it_is_and_is_not_taken_of_too_much() -> None:
+    state = {"weights": torch.ones(2), "more": [np.ones(2, np.float32)], "step": 3}
+    taken = snapshot(state, 16)
+    state["weights"].fill_(9.0)  # type: ignore[attr-defined]
+    state["more"][0][:] = 9.0  # type: ignore[index]
+    assert taken["step"] == 3
+    assert taken["weights"].tolist() == [1.0, 1.0]
+    assert taken["more"][0].tolist() == [1.0, 1.0]
+    assert snapshot(state, 15) is None
 
 
 def test_a_skeleton_of_unknown_kind_is_refused() -> None:

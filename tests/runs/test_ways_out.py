@@ -1,0 +1,222 @@
+"""However a run ends: it is saved, says why, and has its exit code."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from torch.utils.tensorboard import SummaryWriter
+
+from trainers import evaluate
+from trainers import run as run_module
+from trainers.algorithms.ppo import PPO
+from trainers.comparison.results import read_status
+from trainers.experience.env_runner import EnvRunner
+from trainers.learn import main
+from trainers.runfile.registry import load_registries
+
+Learn = Callable[..., Any]
+WriteRun = Callable[..., Path]
+REPOSITORY = Path(__file__).parents[2]
+CARTPOLE = {"type": "gymnasium", "id": "CartPole-v1", "num_envs": 2}
+BREAKING = """
+import sys
+import numpy as np
+from pydantic import BaseModel
+from trainers.hookspecs import hookimpl
+
+
+class Breaking:
+    class Settings(BaseModel, frozen=True, extra="forbid"):
+        leave: bool = False
+
+    def __init__(self, settings):
+        self.leave, self.calls = settings.leave, 0
+
+    def __call__(self, transition):
+        self.calls += 1
+        if self.calls > 9:
+            return sys.exit(0) if self.leave else self.rewards(transition, 0)
+        return np.zeros(2)
+
+    def rewards(self, transition, weight):
+        return transition.rewards.sum().item() // weight
+
+
+@hookimpl
+def ventosa_rewards():
+    return {"breaks": Breaking}
+"""
+
+
+def at_call(
+    monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, number: int, action: Callable[[], None]
+) -> None:
+    """Does something just before the nth call of a method from now."""
+    method, calls = getattr(owner, name), iter(range(1, 10**6))
+
+    def called(self: Any, *arguments: Any) -> Any:
+        if next(calls) == number:
+            action()
+        return method(self, *arguments)
+
+    monkeypatch.setattr(owner, name, called)
+
+
+@pytest.mark.parametrize(
+    ("leave", "reason", "line"),
+    [
+        (False, "ZeroDivisionError: float floor division by zero", ".sum().item() // weight"),
+        (True, "SystemExit: 0", "return sys.exit(0) if self.leave"),
+    ],
+    ids=["raises", "leaves"],
+)
+def test_a_plugin_that_fails_is_named_with_its_lines_and_leaves_the_run_saved(
+    learn: Learn,
+    write_run: WriteRun,
+    monkeypatch: pytest.MonkeyPatch,
+    install_plugin: Callable[[str, str], Path],
+    capfd: pytest.CaptureFixture[str],
+    leave: bool,
+    reason: str,
+    line: str,
+) -> None:
+    install_plugin("reward_that_breaks", BREAKING)
+    monkeypatch.setattr(run_module, "load_registries", load_registries)
+    config = write_run(CARTPOLE, rewards=[{"type": "breaks", "leave": leave}])
+    done = learn(config)
+    assert done.code == 1
+    failed = f"plugin 'own' (reward-that-breaks 1.2) failed: {reason}"
+    saved = done.results / "toy/checkpoints/step-16"  # 8 steps of 2 environments
+    said, *lines = done.errors.splitlines()
+    assert said == f"error: {failed}; the last good checkpoint is {saved}"
+    assert any(line in own for own in lines)
+    assert len(lines) < 10
+    assert "Traceback" not in done.errors
+    status = read_status(done.results / "toy")
+    assert (status["state"], f"error: {status['reason']}") == ("failed", said)
+    assert status["last_checkpoint"] == str(saved)
+    assert evaluate.main(["toy", "--results-dir", str(done.results)]) == 1
+    assert capfd.readouterr().err.startswith(f"error: {failed}\n")
+
+
+def test_a_bug_of_ours_keeps_its_traceback_names_the_last_checkpoint_and_says_so_in_the_status(
+    learn: Learn, write_run: WriteRun, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def fail() -> None:
+        raise KeyError("a bug")
+
+    at_call(monkeypatch, PPO, "update", 3, fail)
+    with pytest.raises(KeyError) as failed:
+        learn(write_run())
+    last = f"the last good checkpoint is {tmp_path / 'results/toy/checkpoints/step-32'}"
+    assert failed.value.__notes__ == [last]
+    status = read_status(tmp_path / "results/toy")
+    assert (status["state"], status["reason"]) == ("failed", f"KeyError: 'a bug'; {last}")
+
+
+@pytest.mark.parametrize("owner", [PPO, EnvRunner], ids=["update", "collection"])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=["sigterm", "sighup"])
+def test_a_signal_is_heard_in_updates_as_in_collections(
+    learn: Learn,
+    write_run: WriteRun,
+    monkeypatch: pytest.MonkeyPatch,
+    owner: type,
+    number: signal.Signals,
+) -> None:
+    name, calls = ("_optimizer_step", 5) if owner is PPO else ("step", 11)
+    at_call(monkeypatch, owner, name, calls, lambda: os.kill(os.getpid(), number))
+    done = learn(write_run(), "trainer.checkpoint_interval=1000")
+    assert done.code == 143
+    assert done.step == 32  # before the third collection, and its update
+    assert read_status(done.results / "toy")["state"] == "interrupted"
+
+
+def test_the_second_signal_ends_a_run_at_once(
+    learn: Learn, write_run: WriteRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def insist() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    at_call(monkeypatch, EnvRunner, "step", 11, insist)
+    done = learn(write_run(), "trainer.checkpoint_interval=1000")
+    assert done.code == 143
+    assert done.checkpoints == []
+    status = read_status(done.results / "toy")
+    assert status["state"] == "interrupted"
+    assert status["reason"] == "stopped at once; no checkpoint was saved yet"
+
+
+def test_a_log_that_can_not_be_written_is_told_once_and_the_run_goes_on(
+    learn: Learn,
+    write_run: WriteRun,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def fail(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(SummaryWriter, "add_scalar", fail)
+    done = learn(write_run())
+    assert (done.code, done.step) == (0, 64)
+    assert read_status(done.results / "toy")["state"] == "finished"
+    assert sum("the log can't be written" in message for message in caplog.messages) == 1
+
+
+def until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 120.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_a_run_that_was_killed_is_not_running_for_ever(write_run: WriteRun, learn: Learn) -> None:
+    config = write_run("target", {"max_steps": 10**9})
+    results = config.parent / "results"
+    child = os.fork()
+    if child == 0:
+        try:
+            main([str(config), "--results-dir", str(results)])
+        finally:  # never back into pytest
+            os._exit(99)
+    until((results / "toy/status.json").exists)
+    assert read_status(results / "toy")["state"] == "running"
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert json.loads((results / "toy/status.json").read_text())["state"] == "running"
+    assert read_status(results / "toy")["state"] == "interrupted"
+
+
+def test_a_closed_output_and_the_end_of_the_terminal_lose_nothing(
+    write_run: WriteRun, tmp_path: Path
+) -> None:
+    config = write_run(CARTPOLE, {"max_steps": 10**9})
+    process = subprocess.Popen(
+        [sys.executable, "-m", "trainers.learn", str(config)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    assert process.stdout.readline() == "toy: to step 1G\n"
+    process.stdout.close()  # as `| head -1` does
+    run = tmp_path / "results/toy"
+    until((run / "checkpoints/step-256").exists)
+    process.send_signal(signal.SIGHUP)
+    assert "Error" not in process.stderr.read()
+    assert process.wait(timeout=120) == 143
+    assert read_status(run)["reason"] == "stopped, and saved"
+    assert read_status(run)["step"] >= 256
