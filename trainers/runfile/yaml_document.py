@@ -8,6 +8,7 @@ misread.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -23,6 +24,11 @@ KeyPath = tuple[str | int, ...]
 
 LARGEST_EXACT_INTEGER = 2**53
 """Up to here every whole number has a float of its own."""
+
+MOST_VALUES = 100_000
+"""Of a run file, aliases and merges written out: they can grow to billions from a few lines."""
+DEEPEST = 100
+"""Mappings and lists within each other: whatever walks through them may do so by recursion."""
 
 TAG = "tag:yaml.org,2002:"
 CORE_SCHEMA = (
@@ -185,7 +191,8 @@ def parse(text: str, origin: str, lines: bool = False) -> Document:
         lines: name lines of `origin`.
 
     Raises:
-        SettingsError: the text is no YAML, or has duplicate keys.
+        SettingsError: the text is no YAML, has duplicate keys, or is larger or deeper than any run
+            file, its aliases written out.
     """
     reader = _Reader(text, origin, lines)
     try:
@@ -219,9 +226,23 @@ class _Reader:
         self.loader = _Loader(self.text)
         try:
             root = self.loader.get_single_node()
-            return None if root is None else self.plain(root, (), root)
+            if root is None:
+                return None
+            self.check_extent(root)
+            return self.plain(root, (), root)
         finally:
             self.loader.dispose()
+
+    def check_extent(self, root: yaml.Node) -> None:
+        """Refuse what would grow without bound if its aliases were written out; none is here."""
+        values, depth = _extent(root, {})
+        if values > MOST_VALUES:
+            message = f"has over {MOST_VALUES} values, aliases written out: too many for a run file"
+        elif depth > DEEPEST:
+            message = f"is nested over {DEEPEST} deep, aliases written out: too deep for a run file"
+        else:
+            return
+        raise SettingsError([Problem(self.origin, (), message)])
 
     def place(self, line: int) -> str:
         """Name a line, counted from 0."""
@@ -280,6 +301,22 @@ class _Reader:
 
     def problem(self, node: yaml.Node, path: KeyPath, message: str) -> None:
         self.problems.append(Problem(self.place(node.start_mark.line), path, message))
+
+
+def _extent(node: yaml.Node, known: dict[int, tuple[int, int]]) -> tuple[int, int]:
+    """Values and depth of a node with its aliases written out; each node is looked at once.
+
+    Raises:
+        RecursionError: an alias contains itself.
+    """
+    if isinstance(node, yaml.ScalarNode):
+        return 1, 0
+    if id(node) not in known:
+        is_mapping = isinstance(node, yaml.MappingNode)
+        parts = itertools.chain(*node.value) if is_mapping else node.value
+        values, depths = zip((1, 0), *(_extent(part, known) for part in parts), strict=True)
+        known[id(node)] = sum(values), 1 + max(depths)
+    return known[id(node)]
 
 
 def scalar(node: yaml.ScalarNode) -> str | int | float | bool | None:

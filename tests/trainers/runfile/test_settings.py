@@ -389,6 +389,30 @@ class TestUnreadable:
     def test_nesting_without_end(self) -> None:
         assert "nested too deeply" in refused("[" * 5000)[0]
 
+    @pytest.mark.parametrize("grown", ["[{}]", "{{<<: [{}]}}"])
+    def test_aliases_that_grow_to_billions(self, grown: str) -> None:
+        lines = ["a0: &a0 {x: 1}"]
+        for level in range(1, 11):
+            nine = ", ".join([f"*a{level - 1}"] * 9)
+            lines.append(f"a{level}: &a{level} {grown.format(nine)}")
+        assert refused("\n".join(lines)) == [
+            "run.yaml: has over 100000 values, aliases written out: too many for a run file"
+        ]
+
+    def test_aliases_count_as_often_as_they_stand(self) -> None:
+        # 155 numbers in a list are 156 values; 641 of those, a list around 640, two keys, the top.
+        text = "a: &a [{}]\nb: [{}]\n".format(", ".join(["1"] * 155), ", ".join(["*a"] * 640))
+        assert 156 * 641 + 4 == 100_000
+        assert len(parse(text, "text").data["b"]) == 640
+        with pytest.raises(SettingsError, match="too many for a run file"):
+            parse(text.replace("b: [", "b: [1, "), "text")
+
+    def test_aliases_that_grow_deep(self) -> None:
+        chain = "".join(f"- &a{n + 1} [*a{n}]\n" for n in range(200))
+        assert refused(f"- &a0 []\n{chain}") == [
+            "run.yaml: is nested over 100 deep, aliases written out: too deep for a run file"
+        ]
+
 
 class TestInvalid:
     @pytest.mark.parametrize(
