@@ -387,10 +387,13 @@ def _write_weights(path: Path, weights: Mapping[str, torch.Tensor]) -> None:
 
 def _write_safetensors(path: Path, content: Any, *, torch_tensors: bool = False) -> None:
     save_file = safetensors.torch.save_file if torch_tensors else safetensors.numpy.save_file
+    path.touch()
+    mode = path.stat().st_mode
     try:
         save_file(content, path)
     except safetensors.SafetensorError as error:  # this is how it reports a full disk
         raise OSError(str(error)) from error
+    path.chmod(mode)  # safetensors lets nobody else read what it writes; the user's umask decides
 
 
 def _move_into_place(temporary: Path, path: Path) -> None:
