@@ -89,6 +89,15 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
         """
         return {}
 
+    @classmethod
+    def imports(cls, settings: BaseModel) -> tuple[str, ...]:
+        """Modules that the settings name, and that building it imports.
+
+        Where the settings came with a stranger's policy, the user is asked first. None need be
+        declared that is imported whatever the settings say.
+        """
+        return ()
+
     def set_parameters(self, parameters: Mapping[str, ParameterValue]) -> None:
         """Sets environment parameters; they hold from each environment's next reset on."""
         if unknown := sorted(set(parameters) - self.parameter_names):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from trainers.calibration import calibrate
 from trainers.common.command import DONE, tells_failures
-from trainers.evaluate import positive, seed_number
+from trainers.evaluate import add_trust_option, positive, seed_number
 from trainers.inference.confidence import NEVER, Card, Measured
 
 EPISODES = 80_000
@@ -24,6 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         episodes=options.episodes,
         seed=options.seed,
         results_dir=options.results_dir,
+        trust=options.trust,
     )
     print(f"{path}: {card.episodes} episodes, seed {card.seed}")
     print("\n".join(told(card)))
@@ -44,6 +45,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--episodes", type=positive, default=EPISODES, help="how many (default: %(default)s)"
     )
     parser.add_argument("--seed", type=seed_number, default=0, help="of the episodes")
+    add_trust_option(parser)
     parser.add_argument(
         "--results-dir", type=Path, default=Path("results"), help="where runs are kept"
     )

@@ -66,7 +66,12 @@ EPISODES_PER_HARDER = 20
 
 
 def calibrate(
-    name: str, *, episodes: int, seed: int = 0, results_dir: Path = Path("results")
+    name: str,
+    *,
+    episodes: int,
+    seed: int = 0,
+    results_dir: Path = Path("results"),
+    trust: bool = False,
 ) -> tuple[Path, Card]:
     """Learns how sure a policy is, and stores that beside its weights.
 
@@ -75,6 +80,7 @@ def calibrate(
         episodes: how many first actions to learn from, choose the threshold by, and measure with.
         seed: of the episodes, which neither a run nor an evaluation has; below `SEED_LIMIT`.
         results_dir: where a run is looked for by its id.
+        trust: see `trainers.evaluation.find_run`.
 
     Returns:
         The file that was written, and what is in it for people.
@@ -91,8 +97,8 @@ def calibrate(
             f"--episodes {episodes}: nothing can be learned from under {LEAST_EPISODES}"
         )
     folder = find_checkpoint(name, results_dir).path
+    _, run = find_run(name, (), results_dir, trust=trust)
     policy = Policy.load(name, results_dir=results_dir, full_precision=True)
-    _, run = find_run(name, (), results_dir)
     with closing(evaluation_environment(run, episodes)) as env:
         features, metrics = _answered(policy, env, episodes, FIRST_SEED + seed)
         evaluator = env.evaluator()

@@ -37,6 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check=options.check,
         window=options.window,
         render=options.render,
+        trust=options.trust,
     )
     if options.json is not None:
         _write(options.json, evaluation.report)
@@ -60,7 +61,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     environment = None
     if policy is not None:
         with _policy_first(rest[0]):
-            environment = _environment(policy, known.results_dir)
+            environment = _environment(policy, known)
     offered = () if environment is None else environment.cls.evaluation_options
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
@@ -101,10 +102,20 @@ def _generic_options() -> argparse.ArgumentParser:
         help="draw pictures into DIR (default: evaluation/ in the run's folder)",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here, too")
+    add_trust_option(parser)
     parser.add_argument(
         "--results-dir", type=Path, default=Path("results"), help="where runs are kept"
     )
     return parser
+
+
+def add_trust_option(parser: argparse.ArgumentParser) -> None:
+    """Adds the option with which a policy's environment may import what its run file names."""
+    parser.add_argument(
+        "--trust",
+        action="store_true",
+        help="import the modules that the policy's environment names, as in id: MODULE:ID",
+    )
 
 
 @contextmanager
@@ -121,8 +132,8 @@ def _policy_first(word: str) -> Iterator[None]:
         raise UserError(f"{error}; the policy comes before {word}") from error
 
 
-def _environment(policy: str, results_dir: Path) -> Component:
-    _, run = find_run(policy, (), results_dir)
+def _environment(policy: str, known: argparse.Namespace) -> Component:
+    _, run = find_run(policy, (), known.results_dir, trust=known.trust)
     return run.environment
 
 

@@ -33,6 +33,7 @@ from trainers.reporting.figures import (
 )
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import RunSettings, load_run, load_run_document
+from trainers.runfile.trust import check_imports
 from trainers.runfile.yaml_document import parse
 from trainers.saving.evaluation_folder import EVALUATION, EvaluationFolder
 from trainers.saving.run_folder import CONFIGURATION, find_run_folder
@@ -128,6 +129,7 @@ def evaluate(
     check: bool = False,
     window: bool = False,
     render: str | None = None,
+    trust: bool = False,
 ) -> Evaluation:
     """Evaluates a saved policy on the last lesson's task.
 
@@ -141,13 +143,14 @@ def evaluate(
         check: try the first actions out in the environment's physical check.
         window: show that check as it goes.
         render: the folder for pictures; empty for `evaluation` in the run's own; None for none.
+        trust: see `find_run`.
 
     Raises:
         UserError: there is no such policy, it does not fit its configuration, or what is asked for
             can't be had.
         EnvironmentFailure, NonFiniteError: the environment broke down.
     """
-    folder, run = find_run(policy, overrides, results_dir)
+    folder, run = find_run(policy, overrides, results_dir, trust=trust)
     acting = _load(policy, results_dir, run.device, seed)
     count = episodes or run.environment.cls.evaluation_episodes
     with closing(evaluation_environment(run, count)) as env, ExitStack() as stack:
@@ -168,22 +171,34 @@ def evaluate(
     return Evaluation(report, report_figures(evaluator))
 
 
-def find_run(policy: str, overrides: Sequence[str], results_dir: Path) -> tuple[Path, RunSettings]:
+def find_run(
+    policy: str, overrides: Sequence[str], results_dir: Path, *, trust: bool = False
+) -> tuple[Path, RunSettings]:
     """Folder and settings of the run a saved policy comes from; its weights are not used.
 
+    Args:
+        policy: see `evaluate`.
+        overrides: the same.
+        results_dir: the same.
+        trust: import the modules that it names.
+
     Raises:
-        UserError: there is no such policy, a plugin that it needs is not installed here, or its
-            configuration is not valid.
+        UserError: there is no such policy, a plugin that it needs is not installed here, its
+            configuration is not valid, or names modules that nobody said to import.
     """
     registries = load_registries()
     if is_onnx(policy):
-        text = OnnxPolicy.load(policy).configuration
-        document = parse(text, f"{policy}: {CONFIGURATION}", lines=True)
-        return Path(policy).parent, load_run_document(document, overrides, registries)
-    folder = find_run_folder(policy, results_dir)
-    if metadata := read_metadata(folder):
-        metadata.check_plugins(registries, folder)
-    return folder, load_run(folder / CONFIGURATION, overrides, registries)
+        folder, origin = Path(policy).parent, f"{policy}: {CONFIGURATION}"
+        document = parse(OnnxPolicy.load(policy).configuration, origin, lines=True)
+        run = load_run_document(document, overrides, registries)
+    else:
+        folder = find_run_folder(policy, results_dir)
+        if metadata := read_metadata(folder):
+            metadata.check_plugins(registries, folder)
+        origin = str(folder / CONFIGURATION)
+        run = load_run(folder / CONFIGURATION, overrides, registries)
+    check_imports(run, origin, trust=trust)
+    return folder, run
 
 
 def _load(policy: str, results_dir: Path, device: str, seed: int) -> SavedPolicy:

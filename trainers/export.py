@@ -14,6 +14,7 @@ from envs.environment import EnvironmentFailure
 from trainers.common.command import DONE, tells_failures
 from trainers.common.errors import UserError, first_lines
 from trainers.common.files import write_atomically
+from trainers.evaluate import add_trust_option
 from trainers.evaluation import FIRST_SEED, evaluation_environment, find_run
 from trainers.inference.confidence import FILE as CONFIDENCE
 from trainers.inference.confidence import read_confidence, to_bytes, weights_digest
@@ -45,6 +46,8 @@ CHECKED = 100
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exports a policy; returns the exit code."""
     options = parse(arguments)
+    if options.trust:
+        find_run(options.policy, (), options.results_dir, trust=True)
     if options.format == ONNX or is_onnx(options.folder):
         print("\n".join(export_onnx(options)))
     else:
@@ -70,6 +73,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     add_camera_options(parser)
     parser.add_argument("--force", action="store_true", help="replace a policy that is there")
+    add_trust_option(parser)
     parser.add_argument(
         "--results-dir", type=Path, default=Path("results"), help="where runs are kept"
     )

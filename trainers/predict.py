@@ -21,6 +21,8 @@ from envs.views import View
 from trainers.common.command import DONE, tells_failures
 from trainers.common.errors import UserError
 from trainers.common.files import write_atomically
+from trainers.evaluate import add_trust_option
+from trainers.evaluation import find_run
 from trainers.inference.confidence import Card
 from trainers.inference.fitting import load_raw_policy
 from trainers.inference.onnx_policy import OnnxPolicy, is_onnx
@@ -132,6 +134,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         metavar="OUT",
         help="draw it over the image: a PNG for one image, a folder for several",
     )
+    add_trust_option(parser)
     parser.add_argument(
         "--results-dir", type=Path, default=Path("results"), help="where runs are kept"
     )
@@ -148,6 +151,8 @@ def predict(options: argparse.Namespace) -> list[Prediction]:
         UserError: there is no such policy, image or camera, they don't fit each other, or a picture
             can't be written.
     """
+    if options.trust:
+        find_run(options.policy, (), options.results_dir, trust=True)
     policy = _load(options)
     name = _only_image(policy)
     drawings = _drawings(options.draw, options.images)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
 from envs.environment import Environment, EnvironmentFailure, ObservationArrays, StepResult
 from envs.evaluation import SUCCESS
@@ -69,6 +70,13 @@ class GymEnvironment(Environment):
         self._history = ActionHistory(self.action_space.shape or (), self.action_space.dtype)
         self._observations: ObservationArrays = {}
         self._tells_success = False  # no episode that did has ended yet
+
+    @classmethod
+    def imports(cls, settings: BaseModel) -> tuple[str, ...]:
+        """See `Environment.imports`."""
+        assert isinstance(settings, GymSettings)
+        module, colon, _ = settings.id.partition(":")
+        return (module,) if colon else ()
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None

@@ -191,7 +191,7 @@ def test_help_lists_the_environments_own_options(
 @pytest.mark.parametrize(
     ("environment", "option", "told"),
     [
-        ("darts", "--trow", "unknown option --trow; did you mean '--throw'?"),
+        ("darts", "--thow", "unknown option --thow; did you mean '--throw'?"),
         ("darts", "--dart5=3", "unknown option --dart5; did you mean '--darts'?"),
         ("target", "--throw", "unknown option --throw; known: --episodes, --help, --json"),
         ("target", "--results_dir=x", "unknown option --results_dir; did you mean '--results-dir'"),

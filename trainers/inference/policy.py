@@ -31,6 +31,7 @@ from trainers.networks.policy_network import PolicyNetwork
 from trainers.networks.recurrent import Sequences
 from trainers.runfile.registry import load_registries, plugin_manager
 from trainers.runfile.settings import Component, load_policy, load_run
+from trainers.runfile.trust import check_imports
 from trainers.saving.checkpoint import Loaded
 from trainers.saving.run_folder import CONFIGURATION, find_checkpoint, run_folder
 
@@ -240,12 +241,14 @@ def find_metadata(folder: Path) -> Metadata:
         folder: of the run, or of an exported policy.
 
     Raises:
-        UserError: the file is damaged, or the environment can't be built.
+        UserError: the file is damaged, the environment can't be built, or names modules that nobody
+            said to import.
     """
     if found := read_metadata(folder):
         return found
     registries = load_registries()
     run = load_run(folder / CONFIGURATION, [], registries).with_environments(1)
+    check_imports(run, str(folder / CONFIGURATION))
     try:
         env: Environment = run.environment.cls(run.environment.settings, [], 0)
     except ValueError as error:
