@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from typing import Any
 
@@ -14,6 +15,8 @@ from encoders.cameras import Pinhole, Sampling
 from encoders.spaces import DepthImage, RgbImage
 
 Plain = dict[str, Any]
+LARGEST_IMAGE, LARGEST_VECTOR = 2**26, 2**20
+"""Values of what has several axes, and of what has one: a shape is not to take all memory."""
 
 
 def space_to_plain(space: gymnasium.Space[Any]) -> Plain:
@@ -61,26 +64,30 @@ def space_from_plain(plain: Plain) -> gymnasium.Space[Any]:
     """The space that `space_to_plain` wrote.
 
     Raises:
-        ValueError: the data are of no kind of space.
+        ValueError: the data are of no kind of space, or of one too large.
         KeyError: something is missing in them.
+        TypeError, OverflowError, AttributeError, AssertionError: something in them is of another
+            type, or out of bounds.
     """
     fields = {key: value for key, value in plain.items() if key != "type"}
     match plain["type"]:
         case "dict":
+            if not fields["entries"]:
+                raise ValueError("a space of no observations")
             # As pairs: gymnasium would sort a dictionary, and networks concatenate in this order.
             return gymnasium.spaces.Dict(
                 [(name, space_from_plain(part)) for name, part in fields["entries"].items()]
             )
         case "discrete":
+            _check_shape([fields["n"]])
             return Discrete(fields["n"], start=fields["start"])
         case "depth_image":
             return _depth_image(fields)
         case "rgb_image":
+            _check_shape([fields["height"], fields["width"], 3])
             return RgbImage(**{**fields, "sampling": _sampling(fields.get("sampling"))})
         case "box":
-            dtype, shape = np.dtype(fields["dtype"]), tuple(fields["shape"])
-            low, high = (_bound_from_plain(fields[key], dtype, shape) for key in ("low", "high"))
-            return Box(low, high, dtype=dtype.type)
+            return _box(fields)
     raise ValueError(f"a space of the unknown type {plain['type']!r}")
 
 
@@ -92,7 +99,24 @@ def _sampling(fields: Plain | None) -> Sampling | None:
     return None if fields is None else Sampling(**fields)
 
 
+def _check_shape(shape: list[int]) -> None:
+    """Raises ValueError where a shape has no values, or more than there may be."""
+    largest = LARGEST_IMAGE if len(shape) > 1 else LARGEST_VECTOR
+    if not all(type(size) is int and size > 0 for size in shape) or math.prod(shape) > largest:
+        raise ValueError(f"a space of the shape {shape}: sizes are from 1 on, in all {largest}")
+
+
+def _box(fields: Plain) -> Box:
+    dtype, shape = np.dtype(str(fields["dtype"])), fields["shape"]
+    _check_shape(shape)
+    low, high = (_bound_from_plain(fields[key], dtype, tuple(shape)) for key in ("low", "high"))
+    if dtype.kind not in "biuf" or not (low <= high).all():
+        raise ValueError(f"a space of {dtype} from {low.min()} to {high.max()}")
+    return Box(low, high, dtype=dtype.type)
+
+
 def _depth_image(fields: Plain) -> DepthImage:
+    _check_shape([fields["height"], fields["width"]])
     pinhole = fields.get("pinhole") and Pinhole(**fields["pinhole"])
     # Of policies from before cameras had a centre: square pixels, and the axis in the middle.
     if focal_px := fields.pop("focal_length_px", None):
@@ -111,6 +135,13 @@ def _bound_to_plain(bound: NDArray[Any]) -> Any:
 def _bound_from_plain(plain: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     # Integers stay integers: 2^64 - 1 is no float64.
     kind = int if np.issubdtype(dtype, np.integer) else float
+    values = plain if isinstance(plain, list) else [plain]
+    if wrong := [value for value in values if not _is_bound(value)]:
+        raise ValueError(f"a bound is {wrong[0]!r}")
     if isinstance(plain, list):
         return np.array([kind(value) for value in plain], dtype).reshape(shape)
     return np.full(shape, kind(plain), dtype)
+
+
+def _is_bound(value: Any) -> bool:
+    return value in ("inf", "-inf") or type(value) in (int, float)

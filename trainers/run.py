@@ -11,6 +11,7 @@ from pathlib import Path
 
 from envs.environment import EnvironmentFailure
 from trainers.algorithms.base import TrainerSettings
+from trainers.common.averager import Averager
 from trainers.common.command import told
 from trainers.common.errors import UserError, first_lines
 from trainers.common.files import write_atomically
@@ -18,6 +19,7 @@ from trainers.common.origin import blaming_plugins
 from trainers.common.timers import Timer, recording
 from trainers.experience.env_runner import StopRequested
 from trainers.held_out import HeldOutEvaluation
+from trainers.inference.construction import check_weights, load_weights
 from trainers.inference.metadata import FILE as METADATA
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.summary import Summary
@@ -34,8 +36,9 @@ from trainers.saving.run_folder import (
     find_checkpoint,
     run_name,
 )
+from trainers.saving.serialization import mismatch
 from trainers.session import Session
-from trainers.training import Ending, Training
+from trainers.training import SCORING, Ending, Training
 
 TIMERS = "timers.json"
 
@@ -204,11 +207,11 @@ def _start(session: Session, options: argparse.Namespace, resumed: Loaded | None
     if options.initialize_from:
         given = find_checkpoint(options.initialize_from, options.results_dir)
         try:
-            session.algorithm.policy.load_state_dict(given.weights)
-        except RuntimeError as error:
+            load_weights(session.algorithm.policy, given.weights)
+        except ValueError as error:
             raise UserError(
                 f"--initialize-from {options.initialize_from}: these weights do not fit the run "
-                f"file's networks: {first_lines(error, 2)}. The {CONFIGURATION} that they "
+                f"file's networks: {error}. The {CONFIGURATION} that they "
                 "came with has the observations and the networks that they are for"
             ) from error
         notes = [
@@ -227,17 +230,39 @@ def _go_on(session: Session, resumed: Loaded) -> None:
         UserError: the state does not fit it.
         EnvironmentFailure: its environments broke down.
     """
+    session.reset()  # so that there is a state which the saved one should be like
     try:
-        session.load_state_dict(resumed.weights, resumed.state)
-    except EnvironmentFailure:
-        raise
-    except (RuntimeError, ValueError, KeyError) as error:
+        _load(session, resumed)
+    except EnvironmentFailure as failure:
+        raise EnvironmentFailure(f"{resumed.path}: when played again, {failure}") from failure
+    except Exception as error:  # the state is a file's: it may be wrong in any way
         run = resumed.path.parents[1]
         raise UserError(
-            f"{resumed.path}: the run can't go on from here: {first_lines(error, 2)}. --resume "
-            "needs the run file, and the version of ventosa, that the run began with; to begin "
-            f"another run with its weights, use --initialize-from {run}"
+            f"{resumed.path}: the run can't go on from here: {type(error).__name__}: "
+            f"{first_lines(error, 2)}. --resume needs the run file, and the version of ventosa, "
+            f"that the run began with; to begin another run with its weights, use "
+            f"--initialize-from {run}"
         ) from error
+
+
+def _load(session: Session, resumed: Loaded) -> None:
+    """Takes a session to a saved state.
+
+    Raises:
+        ValueError: the state is not of the session's kind, or of another step than it is said to
+            be; whatever else a state leads to that is of the right kind, and doesn't fit.
+    """
+    state, scoring = resumed.state, Averager()
+    own = {"step": 0, SCORING: scoring.state_dict(), **session.state_dict()}
+    if wrong := mismatch(state, own) or mismatch(resumed.weights, session.weights(), "weights"):
+        raise ValueError(wrong)
+    session.load_state_dict(resumed.weights, state)
+    check_weights(session.algorithm.policy)
+    steps = {state["step"], session.env_runner.step_count, resumed.step}
+    if len(steps) > 1:
+        raise ValueError(f"it is said to be of several steps: {', '.join(map(str, sorted(steps)))}")
+    if SCORING in state:  # not in those of former versions
+        scoring.load_state_dict(state[SCORING])
 
 
 def _flags(options: argparse.Namespace) -> list[str]:

@@ -140,7 +140,12 @@ class GymEnvironment(Environment):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> ObservationArrays:
-        """See `Environment.load_state_dict`; plays the running episodes again."""
+        """See `Environment.load_state_dict`; plays the running episodes again.
+
+        Raises:
+            ValueError: the state has other actions than those of its episodes.
+        """
+        self._check(state)
         self._seed = state["seed"]
         self._begun, self._lengths = state["begun"].copy(), state["lengths"].copy()
         self._history.load(state["actions"])
@@ -155,6 +160,16 @@ class GymEnvironment(Environment):
                 self._id,
             )
         return self._observations
+
+    def _check(self, state: dict[str, Any]) -> None:
+        """Refuses a state of which nothing can be played; see `load_state_dict`."""
+        begun, lengths, actions = state["begun"], state["lengths"], state["actions"]
+        if not begun.shape == lengths.shape == actions.shape[1:2] == (self.num_envs,):
+            raise ValueError(f"it was saved with {len(begun)} environments, not {self.num_envs}")
+        if begun.min() < 1 or lengths.min() < 0 or lengths.max() > len(actions):
+            raise ValueError(
+                f"episodes {begun} of {lengths} steps, where {len(actions)} have actions"
+            )
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the environments, and their processes even where one has died."""

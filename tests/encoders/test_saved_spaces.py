@@ -78,3 +78,28 @@ def test_a_policy_from_before_samplings_sees_the_whole_sensor():
     assert space_from_plain({"type": "rgb_image", "height": 2, "width": 3}) == RgbImage(
         2, 3, sampling=whole
     )
+
+
+BOX = {"type": "box", "low": -1.0, "high": 1.0, "shape": [2], "dtype": "float32"}
+
+
+@pytest.mark.parametrize(
+    ("plain", "said"),
+    [
+        (BOX | {"shape": [2**20 + 1]}, "in all 1048576"),
+        (BOX | {"shape": [2**13, 2**13, 2]}, "in all 67108864"),
+        (BOX | {"shape": [0]}, "sizes are from 1 on"),
+        (BOX | {"shape": [2.0]}, "sizes are from 1 on"),
+        (BOX | {"low": "nan"}, "a bound is 'nan'"),
+        (BOX | {"low": [0.0, float("nan")]}, "a space of float32 from nan"),
+        (BOX | {"high": True}, "a bound is True"),
+        (BOX | {"high": -2.0}, "a space of float32 from -1.0 to -2.0"),
+        ({"type": "discrete", "n": 10**9, "start": 0}, "in all 1048576"),
+        ({"type": "rgb_image", "height": 10**6, "width": 10**6}, "in all 67108864"),
+        ({"type": "depth_image", "height": 10**6, "width": 10**6}, "in all 67108864"),
+        ({"type": "dict", "entries": {}}, "no observations"),
+    ],
+)
+def test_a_space_that_no_environment_has_is_refused(plain: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        space_from_plain(plain)

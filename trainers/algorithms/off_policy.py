@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from trainers.algorithms.augmentation import RandomShift, unchanged
 from trainers.algorithms.base import TrainerSettings
-from trainers.algorithms.optimization import optimizer_step
+from trainers.algorithms.optimization import load_optimizer, optimizer_step
 from trainers.algorithms.schedules import CONSTANT, Schedule
 from trainers.common.averager import Averager
 from trainers.experience.collector import BehaviorOutput, CollectedStep, Collector
@@ -289,6 +289,6 @@ class OffPolicyAlgorithm(ABC):
             self._buffer.load_state_dict(state["replay_buffer"])
         self.policy.load_state_dict(weights)
         for name, optimizer in self._optimizers.items():
-            optimizer.load_state_dict(state[f"{name}_optimizer"])
+            load_optimizer(optimizer, state[f"{name}_optimizer"])
         self._generator.set_state(state["generator"])
         self._pending_updates = state["due"]

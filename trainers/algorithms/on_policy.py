@@ -10,7 +10,7 @@ from gymnasium.spaces import Box
 from pydantic import BaseModel, Field, model_validator
 from torch import Tensor, nn
 
-from trainers.algorithms.optimization import optimizer_step
+from trainers.algorithms.optimization import load_optimizer, optimizer_step
 from trainers.algorithms.schedules import LINEAR, Schedule
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner
@@ -130,7 +130,7 @@ class OnPolicyAlgorithm:
     def load_state_dict(self, weights: dict[str, Tensor], state: dict[str, Any]) -> None:
         """See `Algorithm.load_state_dict`."""
         self.policy.load_state_dict(weights)
-        self._optimizer.load_state_dict(state["optimizer"])
+        load_optimizer(self._optimizer, state["optimizer"])
         self._collector.load_state_dict(state["collector"])
         self._generator.set_state(state["generator"])
 

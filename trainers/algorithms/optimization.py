@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -38,6 +39,25 @@ def optimizer_step(
     if check_finite(loss, norm, step) > max_gradient_norm:
         nn.utils.clip_grads_with_norm_(learned, max_gradient_norm, norm)
     optimizer.step()
+
+
+def load_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
+    """Takes an optimizer back to a state.
+
+    Raises:
+        ValueError: it is that of other parameters, or of another optimizer: torch itself would
+            notice at the next step only.
+    """
+    settings = [group.keys() for group in optimizer.param_groups]
+    optimizer.load_state_dict(state)
+    for known, group in zip(settings, optimizer.param_groups, strict=True):
+        if missing := known - group.keys():
+            raise ValueError(f"the optimizer's state has no {', '.join(sorted(missing))}")
+    for parameter, moments in optimizer.state.items():
+        found = {name: (tuple(each.shape), each.dtype) for name, each in moments.items()}
+        own = tuple(parameter.shape), parameter.dtype
+        if found != {"step": ((), torch.float32), "exp_avg": own, "exp_avg_sq": own}:
+            raise ValueError(f"the optimizer's state of a parameter {own} has {found}")
 
 
 def check_finite(loss: Tensor, gradient_norm: Tensor, step: int) -> float:

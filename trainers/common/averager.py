@@ -36,5 +36,12 @@ class Averager:
         return {"sums": dict(self._sums), "counts": dict(self._counts)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go back to a state."""
-        self._sums, self._counts = dict(state["sums"]), dict(state["counts"])
+        """Go back to a state.
+
+        Raises:
+            ValueError: there are other counts than sums, or something is no number of its kind.
+        """
+        self._sums = {name: float(total) for name, total in state["sums"].items()}
+        self._counts = {name: int(state["counts"][name]) for name in self._sums}
+        if any(count < 1 for count in self._counts.values()):
+            raise ValueError(f"counts that are not positive: {self._counts}")

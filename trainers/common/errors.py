@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from pydantic import ValidationError
+
 
 class UserError(Exception):
     """The user's mistake: the message names it and the way out, and no traceback is shown."""
@@ -34,3 +36,12 @@ def first_lines(error: Exception, count: int) -> str:
     """The first so many lines of a message that goes on for many, such as torch's, in one line."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return " ".join(lines[:count]).rstrip(".")
+
+
+def reason(error: Exception) -> str:
+    """Why a file's content is refused, in a line: of several things that don't fit, the first."""
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        return ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
+    said = str(error).splitlines()
+    return said[0] if said else type(error).__name__

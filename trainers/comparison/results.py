@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field, FiniteFloat
 
-from trainers.common.errors import UserError
-from trainers.runfile.yaml_document import read
+from trainers.common.errors import UserError, reason
+from trainers.runfile.yaml_document import read, shown
 from trainers.saving.run_folder import CONFIGURATION
 from trainers.saving.run_lock import is_held
 
@@ -22,6 +22,21 @@ REWARD, SPEED = "Environment/Cumulative Reward", "Performance/Steps Per Second"
 Curve = tuple[NDArray[np.int64], NDArray[np.float64]]
 """Steps (k,) that rise, and values (k,)."""
 NOTHING: Curve = (np.empty(0, np.int64), np.empty(0))
+
+
+_Count = Annotated[int, Field(ge=0, lt=2**63)]
+
+
+class _Status(BaseModel, frozen=True):
+    """What is read of `status.json`."""
+
+    state: str
+    reason: str | None = None
+    step: _Count = 0
+    lesson: _Count | None = None
+    lessons: _Count | None = None
+    success: FiniteFloat | None = None
+    evaluation: dict[str, FiniteFloat | dict[str, FiniteFloat | None] | None] | None = None
 
 
 @dataclass(frozen=True)
@@ -43,12 +58,14 @@ class RunResult:
     @property
     def seed(self) -> int:
         """Of the run."""
-        return int(self.configuration.get("seed", 0))
+        seed: int = self.configuration.get("seed", 0)
+        return seed
 
     @property
     def step(self) -> int:
         """How far it came."""
-        return int(self.status.get("step", 0))
+        step: int = self.status.get("step", 0)
+        return step
 
     @property
     def evaluation(self) -> Mapping[str, Any]:
@@ -75,9 +92,12 @@ def read_run(folder: Path) -> RunResult:
     """
     if not (folder / CONFIGURATION).is_file():
         raise UserError(f"{folder}: this is no run: it has no {CONFIGURATION}")
-    return RunResult(
-        folder, read(folder / CONFIGURATION).data, read_status(folder), _curves(folder)
-    )
+    configuration = read(folder / CONFIGURATION).data
+    if type(seed := configuration.get("seed", 0)) is not int:
+        raise UserError(
+            f"{folder / CONFIGURATION}: seed: should be a whole number, not {shown(seed)}"
+        )
+    return RunResult(folder, configuration, read_status(folder), _curves(folder))
 
 
 def read_status(folder: Path) -> dict[str, Any]:
@@ -92,12 +112,10 @@ def read_status(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        status = json.loads(path.read_text())
+        status = _Status.model_validate_json(path.read_bytes(), strict=True).model_dump()
     except (OSError, ValueError) as error:
-        raise UserError(f"{path}: can't be read: {error}") from error
-    if not isinstance(status, dict):
-        raise UserError(f"{path}: should be an object, with `state` and `step`")
-    if status.get("state") == "running" and not is_held(folder):
+        raise UserError(f"{path}: can't be read: {reason(error)}") from error
+    if status["state"] == "running" and not is_held(folder):
         status |= {"state": "interrupted", "reason": "its process was killed"}
     return status
 

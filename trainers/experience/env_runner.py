@@ -188,10 +188,11 @@ class EnvRunner:
         Raises:
             ValueError: it is the state of another number of environments.
         """
-        if len(state["reward"]) != self.env.num_envs:
-            raise ValueError(
-                f"it was saved with {len(state['reward'])} environments, not {self.env.num_envs}"
-            )
+        for values in (state["reward"], state["length"], *state["terms"].values()):
+            if values.shape != (self.env.num_envs,):
+                raise ValueError(
+                    f"it was saved with {len(values)} environments, not {self.env.num_envs}"
+                )
         self.observations = self.env.load_state_dict(state["env"])
         self.step_count = state["step_count"]
         self._reward, self._length = state["reward"].copy(), state["length"].copy()

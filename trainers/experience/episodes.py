@@ -122,5 +122,14 @@ class Cohorts:
         return dict(vars(concatenate(self._waiting)))
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes back to a state."""
-        self._waiting = [EpisodeBatch(**state)]
+        """Goes back to a state.
+
+        Raises:
+            ValueError: its episodes have more of one thing than of another.
+        """
+        waiting = EpisodeBatch(**state)
+        named = (*waiting.terms.values(), *waiting.episode_metrics.values())
+        for values in (waiting.rewards, waiting.lengths, *named):
+            if np.shape(values) != (len(waiting),):
+                raise ValueError(f"{np.shape(values)} values for {len(waiting)} finished episodes")
+        self._waiting = [waiting]

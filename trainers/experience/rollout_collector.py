@@ -157,8 +157,15 @@ class RolloutCollector:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes back to a state."""
-        self._collector.hidden_state = state["remembered"].to(self._device)
+        """Goes back to a state.
+
+        Raises:
+            ValueError: it is that of another memory.
+        """
+        before, hidden_state = self._collector.hidden_state, state["remembered"]
+        if hidden_state.shape != before.shape:
+            raise ValueError(f"hidden states of {hidden_state.shape}, not {before.shape}")
+        self._collector.hidden_state = hidden_state.to(self._device)
         if self._reward_normalizer is not None:
             self._reward_normalizer.load_state_dict(state["reward_normalizer"])
 

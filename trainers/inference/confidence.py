@@ -241,10 +241,15 @@ def read_confidence(folder: Path) -> Confidence | None:
             card = Card.model_validate_json((file.metadata() or {})[CARD])
             if card.format != FORMAT:
                 raise ValueError(f"format {card.format}, where this version reads {FORMAT}")
-            confidence = Confidence(card)
-            names = confidence.state_dict()
-            confidence.load_state_dict({name: file.get_tensor(name) for name in names})
-    except (OSError, safetensors.SafetensorError, RuntimeError, ValueError, KeyError) as error:
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        for name, values in arrays.items():
+            if not values.isfinite().all():
+                raise ValueError(f"{name} has values that are not finite")
+        if arrays["mean"].shape != (card.features,):  # before anything of that size is made
+            raise ValueError(f"{card.features} features, where mean is of {arrays['mean'].shape}")
+        confidence = Confidence(card)
+        confidence.load_state_dict(arrays)
+    except Exception as error:  # forged, it can be wrong in any way
         raise UserError(
             f"{path}: can't be used: {first_lines(error, 2)}; {_again(folder)}"
         ) from error

@@ -7,14 +7,15 @@ from typing import Any, TypeVar
 
 import gymnasium
 from pydantic import BaseModel
-from torch import nn
+from torch import Tensor, nn
 
-from trainers.common.errors import UserError
+from trainers.common.errors import UserError, first_lines
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.network import NetworkSettings
 from trainers.networks.observations import is_frame
 from trainers.runfile.registry import Registry
 from trainers.runfile.settings import Component
+from trainers.saving.serialization import mismatch
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -57,6 +58,28 @@ def network_factory(
     for name in encoders:
         factory.check_name(name, "encoders")
     return factory
+
+
+def load_weights(network: nn.Module, weights: Mapping[str, Tensor]) -> None:
+    """Gives a network saved weights, if they are its own.
+
+    Raises:
+        ValueError: they have other names, shapes or types, or are not finite.
+    """
+    if wrong := mismatch(dict(weights), network.state_dict(), "weights"):
+        raise ValueError(wrong)
+    try:
+        network.load_state_dict(weights)
+    except RuntimeError as error:
+        raise ValueError(first_lines(error, 3)) from error
+    check_weights(network)
+
+
+def check_weights(network: nn.Module) -> None:
+    """Raises ValueError where a parameter is not finite; what else a network keeps may be so."""
+    for name, parameter in network.named_parameters():
+        if not parameter.isfinite().all():
+            raise ValueError(f"{name} has values that are not finite")
 
 
 def in_float32(settings: Model) -> Model:

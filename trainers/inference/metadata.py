@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from encoders.saved_spaces import space_from_plain, space_to_plain
 from envs.deployment import Deployment
 from envs.environment import Environment
-from trainers.common.errors import UserError
+from trainers.common.errors import UserError, reason
 from trainers.runfile.registry import Entry, Registries
 from trainers.runfile.settings import RunSettings
-from trainers.runfile.yaml_document import dotted
 
 FILE = "policy.json"
 FORMAT = 1
@@ -98,7 +97,7 @@ class Metadata:
         Raises:
             ValueError: it is not such a file's content.
         """
-        file = _File.model_validate_json(content)
+        file = _File.model_validate_json(content, strict=True)
         if file.format != FORMAT:
             raise ValueError(f"format {file.format}, where this version reads {FORMAT}")
         observation_space = space_from_plain(file.observation_space)
@@ -139,18 +138,10 @@ def read_metadata(folder: Path) -> Metadata | None:
         return Metadata.from_json((folder / FILE).read_bytes())
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except Exception as error:  # forged, a file can be wrong in any way
         raise UserError(
-            f"{folder / FILE}: can't be used: {_reason(error)}; export the policy anew"
+            f"{folder / FILE}: can't be used: {reason(error)}; export the policy anew"
         ) from error
-
-
-def _reason(error: Exception) -> str:
-    """In a line: of several things that don't fit, the first."""
-    if isinstance(error, ValidationError):
-        first = error.errors()[0]
-        return ": ".join(filter(None, (dotted(first["loc"]), first["msg"])))
-    return str(error).splitlines()[0]
 
 
 def _need(name: str, entry: Entry) -> Need:

@@ -67,7 +67,7 @@ class OnnxPolicy:
             )
         try:
             self._read(properties)
-        except (ValueError, KeyError, TypeError) as error:
+        except Exception as error:  # forged, they can be wrong in any way
             raise UserError(
                 f"{origin}: of another version of ventosa ({properties['ventosa']}): "
                 f"{first_lines(error, 2)}; export the policy anew"

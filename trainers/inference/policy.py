@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from envs.deployment import Deployment
 from envs.environment import Environment
 from trainers.common.devices import resolve_device
-from trainers.common.errors import UserError, first_lines
+from trainers.common.errors import UserError
 from trainers.inference.confidence import Confidence, Judgement, read_confidence
-from trainers.inference.construction import in_float32, network_factory
+from trainers.inference.construction import in_float32, load_weights, network_factory
 from trainers.inference.inputs import checked
 from trainers.inference.metadata import Metadata, read_metadata
 from trainers.networks.actions import to_environment
@@ -300,11 +300,10 @@ def _network(
     )
     network: PolicyNetwork = trainer.cls.build_policy(factory, trainer.settings)
     try:
-        network.load_state_dict(loaded.weights)
-    except RuntimeError as error:
+        load_weights(network, loaded.weights)
+    except ValueError as error:
         raise UserError(
-            f"{loaded.path}: these weights do not fit the networks of its {CONFIGURATION}: "
-            f"{first_lines(error, 3)}"
+            f"{loaded.path}: these weights do not fit the networks of its {CONFIGURATION}: {error}"
         ) from error
     return network
 

@@ -29,7 +29,8 @@ def figure_values(report: Mapping[str, Any]) -> Iterator[tuple[str, str, float]]
     for key, value in report.items():
         if key not in FACTS:
             parts = value.items() if isinstance(value, Mapping) else (("", value),)
-            yield from ((key, part, float(number)) for part, number in parts)
+            # What is not finite is null in JSON.
+            yield from ((key, part, float(number)) for part, number in parts if number is not None)
 
 
 def report_figures(evaluator: Evaluator) -> dict[str, Figure]:

@@ -21,6 +21,7 @@ import re
 import secrets
 import shutil
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,10 +30,10 @@ import safetensors
 import safetensors.numpy
 import safetensors.torch
 import torch
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, FiniteFloat, NonNegativeInt, ValidationError
 
-from trainers.common.errors import UserError
-from trainers.common.files import naming, sync, write_atomically
+from trainers.common.errors import UserError, reason
+from trainers.common.files import naming, read_json, sync, write_atomically
 from trainers.saving.serialization import flatten, unflatten
 
 FORMAT = 1
@@ -96,15 +97,15 @@ class CheckpointInfo:
 
 
 class _FileRecord(BaseModel, frozen=True):
-    size: int
+    size: NonNegativeInt
     sha256: str
 
 
 class _Manifest(BaseModel, frozen=True):
     format: int
-    step: int
-    serial: int
-    score: float | None
+    step: int = Field(ge=0, lt=2**63)
+    serial: int = Field(ge=0, lt=2**63)
+    score: FiniteFloat | None
     score_of: str = ""
     files: dict[str, _FileRecord]
 
@@ -446,26 +447,39 @@ def _read(path: Path, with_state: bool) -> Loaded:
     for name in (WEIGHTS, STATE_ARRAYS, STATE) if with_state else (WEIGHTS,):
         _check_size(path, name, manifest)
         _check_content(path, name, manifest)
-    try:
+    with _blaming(WEIGHTS):
         weights = safetensors.torch.load_file(path / WEIGHTS)
-        state = None
-        if with_state:
-            skeleton = json.loads((path / STATE).read_text())
-            state = unflatten(skeleton, safetensors.numpy.load_file(path / STATE_ARRAYS))
-    except (OSError, ValueError, KeyError, safetensors.SafetensorError) as error:
-        raise _DamageError(f"its content can't be read: {error}") from error
+    for name, tensor in weights.items():
+        if tensor.isnan().any():
+            raise _DamageError(f"{WEIGHTS}: {name} has values that are not numbers (NaN)")
+    state = None
+    if with_state:
+        with _blaming(STATE_ARRAYS):
+            arrays = safetensors.numpy.load_file(path / STATE_ARRAYS)
+        with _blaming(STATE):
+            state = unflatten(read_json(path / STATE), arrays)
     return Loaded(manifest.step, weights, state, path, manifest.score, manifest.score_of)
+
+
+@contextmanager
+def _blaming(name: str) -> Iterator[None]:
+    """Calls whatever a file's content leads to damage: forged, it may be of any shape."""
+    try:
+        yield
+    except Exception as error:
+        raise _DamageError(f"the content of {name} can't be used: {reason(error)}") from error
 
 
 def _read_manifest(path: Path) -> _Manifest:
     try:
-        manifest = _Manifest.model_validate_json((path / MANIFEST).read_bytes())
+        content = (path / MANIFEST).read_bytes()
+        manifest = _Manifest.model_validate_json(content, strict=True)
     except FileNotFoundError as error:
         raise _DamageError(f"there is no {MANIFEST} in it") from error
     except OSError as error:
         raise _DamageError(f"{MANIFEST} can't be read: {error.strerror}") from error
     except ValidationError as error:
-        raise _DamageError(f"{MANIFEST} is cut short or damaged") from error
+        raise _DamageError(f"{MANIFEST} is cut short or damaged: {reason(error)}") from error
     if manifest.format != FORMAT:
         raise _DamageError(f"it has format {manifest.format}, this version reads {FORMAT}")
     return manifest

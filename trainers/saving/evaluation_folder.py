@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from trainers.common.errors import UserError
-from trainers.common.files import write_atomically
+from trainers.common.files import read_json, write_atomically
 
 EVALUATION = "evaluation"
 REPORT = "evaluation.json"
@@ -61,6 +61,6 @@ class EvaluationFolder:
 def own_names(folder: Path) -> set[str]:
     """Names of an evaluation's report and of the files it lists; none if it is no evaluation's."""
     try:
-        return {REPORT, *json.loads((folder / REPORT).read_text())[FILES]}
+        return {REPORT, *read_json(folder / REPORT)[FILES]}
     except (FileNotFoundError, ValueError, KeyError, TypeError):
         return set()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import OrderedDict
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,8 @@ _STORED_AS_IS = frozenset(
     )
 )
 _NUMERIC_KINDS = "biufc"
+LARGEST_INTEGER = 2**63
+"""From here on only random generators count."""
 
 _TORCH_DTYPES = {
     str(value).removeprefix("torch."): value
@@ -77,7 +81,7 @@ def unflatten(skeleton: Any, arrays: dict[str, np.ndarray]) -> Any:  # noqa: PLR
         The state. Tensors are on the CPU and need no gradient.
 
     Raises:
-        ValueError: the skeleton holds an object of unknown kind.
+        ValueError: the skeleton holds an object of unknown kind, or an array has another size.
         KeyError: an array is missing.
     """
     if isinstance(skeleton, list):
@@ -85,24 +89,71 @@ def unflatten(skeleton: Any, arrays: dict[str, np.ndarray]) -> Any:  # noqa: PLR
     if not isinstance(skeleton, dict):
         return skeleton
     match skeleton:
-        case {"dict": content}:
+        case {"dict": dict(content)}:
             return {key: unflatten(value, arrays) for key, value in content.items()}
-        case {"items": content}:
-            return {key: unflatten(value, arrays) for key, value in content}
-        case {"ordered": content}:
-            return OrderedDict((key, unflatten(value, arrays)) for key, value in content)
-        case {"tuple": content}:
+        case {"items": list(content)}:
+            return dict(_pairs(content, arrays))
+        case {"ordered": list(content)}:
+            return OrderedDict(_pairs(content, arrays))
+        case {"tuple": list(content)}:
             return tuple(unflatten(item, arrays) for item in content)
-        case {"float": text}:
+        case {"float": str(text)}:
             return float(text)
-        case {"tensor": name, "dtype": dtype, "shape": shape}:
+        case {"tensor": str(name), "dtype": str(dtype), "shape": list(shape)}:
             return _restored_tensor(arrays[name], _TORCH_DTYPES[dtype], shape)
-        case {"array": name, "dtype": dtype, "shape": shape}:
+        case {"array": str(name), "dtype": str(dtype), "shape": list(shape)}:
             return _restored_array(arrays[name], np.dtype(dtype), shape)
-        case {"scalar": name, "dtype": dtype}:
+        case {"scalar": str(name), "dtype": str(dtype)}:
             return _restored_array(arrays[name], np.dtype(dtype), [])[()]
         case _:
             raise ValueError(f"unknown kind of value in the state: {sorted(skeleton)}")
+
+
+def _pairs(content: list[Any], arrays: dict[str, np.ndarray]) -> Iterator[tuple[Any, Any]]:
+    for key, value in content:
+        if type(key) not in (int, str):
+            raise ValueError(f"the key {key!r} is neither str nor int")
+        yield key, unflatten(value, arrays)
+
+
+def mismatch(given: Any, own: Any, path: str = "state") -> str | None:
+    """Where a state is of another kind than one's own, and how; None: nowhere.
+
+    Sizes may differ, and what only one of them has; where one's own is None, anything may be.
+
+    Args:
+        given: nested as `flatten` takes it.
+        own: the same, of what is to take it over.
+        path: of both.
+    """
+    if own is None:
+        return None
+    if _kind(given) != _kind(own):
+        return f"{path} is {_kind(given)}, not {_kind(own)}"
+    pairs: Iterable[tuple[Any, Any, Any]] = ()
+    if isinstance(own, dict):
+        pairs = ((key, given[key], own[key]) for key in own.keys() & given.keys())
+    elif isinstance(own, list | tuple):
+        pairs = zip(itertools.count(), given, own, strict=False)
+    inner = (mismatch(theirs, ours, f"{path}.{key}") for key, theirs, ours in pairs)
+    return next(filter(None, inner), None)
+
+
+def _kind(value: Any) -> str:
+    """The kind of a value, for people and to be compared."""
+    if isinstance(value, torch.Tensor | np.ndarray):
+        axes = "axis" if value.ndim == 1 else "axes"
+        return f"an array of {value.ndim} {axes} of {value.dtype}".replace("torch.", "")
+    if isinstance(value, tuple):
+        return f"a tuple of {len(value)}"
+    if isinstance(value, bool | np.bool_):
+        return "true or false"
+    if isinstance(value, int | float | np.number):
+        is_large = isinstance(value, int) and abs(value) >= LARGEST_INTEGER
+        return "a number beyond 64 bits" if is_large else "a number"
+    if isinstance(value, dict):
+        return "a mapping"
+    return "a list" if isinstance(value, list) else type(value).__name__
 
 
 def _flatten(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:  # noqa: PLR0911
@@ -177,6 +228,7 @@ def _restored_tensor(stored: np.ndarray, dtype: torch.dtype, shape: list[int]) -
     tensor = torch.from_numpy(_writable(stored))
     if tensor.dtype != dtype:
         tensor = tensor.view(dtype)
+    _check_shape(shape, tensor.numel())
     return tensor.reshape(shape)
 
 
@@ -184,7 +236,14 @@ def _restored_array(stored: np.ndarray, dtype: np.dtype[Any], shape: list[int]) 
     array = _writable(stored)
     if array.dtype != dtype:
         array = array.view(dtype)
+    _check_shape(shape, array.size)
     return array.reshape(shape)
+
+
+def _check_shape(shape: list[int], size: int) -> None:
+    """Raises ValueError where so many values don't have a shape; -1 would be made to fit."""
+    if not all(type(each) is int and each >= 0 for each in shape) or math.prod(shape) != size:
+        raise ValueError(f"an array of {size} values can't have the shape {shape}")
 
 
 def _writable(array: np.ndarray) -> np.ndarray:

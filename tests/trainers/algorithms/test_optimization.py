@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from trainers.algorithms.optimization import optimizer_step
+from trainers.algorithms.optimization import load_optimizer, optimizer_step
 from trainers.common.errors import NonFiniteError
 
 INFINITE = float("inf")
@@ -54,3 +54,27 @@ def test_what_the_loss_does_not_know_stays_as_it_is() -> None:
         optimizer_step(optimizer, 2.0 * known, [known, unknown], INFINITE, 7)
     assert known.item() == pytest.approx(0.8)
     assert (unknown.item(), unknown.grad) == (1.0, None)
+
+
+def adam(*shape: int) -> torch.optim.Adam:
+    """An optimizer that took one step."""
+    parameter = nn.Parameter(torch.zeros(shape))
+    parameter.grad = torch.ones(shape)
+    optimizer = torch.optim.Adam([parameter])
+    optimizer.step()
+    return optimizer
+
+
+def test_an_optimizer_goes_back_to_its_own_state_alone() -> None:
+    state = adam(2).state_dict()
+    load_optimizer(other := adam(2), state)
+    assert other.state_dict()["state"][0]["exp_avg"].tolist() == pytest.approx([0.1, 0.1])
+    with pytest.raises(ValueError, match=r"state of a parameter \(\(3,\), torch.float32\) has"):
+        load_optimizer(adam(3), state)
+    del state["state"][0]["exp_avg"]
+    with pytest.raises(ValueError, match=r"has \{'step'"):
+        load_optimizer(adam(2), state)
+    state = adam(2).state_dict()
+    del state["param_groups"][0]["betas"]
+    with pytest.raises(ValueError, match="the optimizer's state has no betas"):
+        load_optimizer(adam(2), state)

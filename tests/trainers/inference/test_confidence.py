@@ -107,7 +107,10 @@ def test_what_is_damaged_is_refused(make: Make, tmp_path: Path) -> None:
     narrow = Card(features=2, errors=(ANGLE,), weights_sha256="", target=0.9, episodes=0, seed=0)
     stretched = make()
     stretched.card = narrow
-    for content in (b"", whole[:-5], whole[:100], to_bytes(stretched)):
+    huge, unknown = make(), make()
+    huge.card = huge.card.model_copy(update={"features": 10**9})
+    unknown.mean[0] = torch.nan
+    for content in (b"", whole[:-5], whole[:100], *map(to_bytes, (stretched, huge, unknown))):
         (tmp_path / FILE).write_bytes(content)
         with pytest.raises(UserError, match=rf"{FILE}: can't be used: .* delete it, and run"):
             read_confidence(tmp_path)

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from trainers.saving.serialization import flatten, snapshot, unflatten
+from trainers.saving.serialization import flatten, mismatch, snapshot, unflatten
 
 TORCH_DTYPES = [
     *(torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.float8_e4m3fn),
@@ -206,3 +206,50 @@ def test_a_snapshot_stays_as_it_is_and_is_not_taken_of_too_much() -> None:
 def test_a_skeleton_of_unknown_kind_is_refused() -> None:
     with pytest.raises(ValueError, match="unknown kind"):
         unflatten({"pickle": "gASVAAAA"}, {})
+
+
+@pytest.mark.parametrize("shape", [[3], [-1], [2.0], [True, 2], "2"])
+def test_an_array_of_another_size_is_refused(shape: Any) -> None:
+    with pytest.raises(ValueError, match=r"can't have the shape|unknown kind"):
+        unflatten({"array": "0", "dtype": "<f8", "shape": shape}, {"0": np.zeros(2)})
+
+
+OWN = {
+    "step": 3,
+    "on": False,
+    "best": None,
+    "rng": {"state": 2**127, "left": 0},
+    "betas": (0.9, 0.99),
+    "groups": [{"lr": 0.1}],
+    "reward": np.zeros(2),
+    "weights": torch.zeros(2, 3),
+}
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"step": 4.0, "best": 0.5, "more": 1, "groups": [], "reward": np.zeros(5)}, None),
+        ({"rng": {"state": 2**126, "left": 2**62}, "weights": torch.ones(9, 9)}, None),
+        ([], "state is a list, not a mapping"),
+        ({"step": "3"}, "state.step is str, not a number"),
+        ({"step": None}, "state.step is NoneType, not a number"),
+        ({"step": True}, "state.step is true or false, not a number"),
+        ({"step": 2**63}, "state.step is a number beyond 64 bits, not a number"),
+        ({"on": 0}, "state.on is a number, not true or false"),
+        ({"rng": {"state": 7}}, "state.rng.state is a number, not a number beyond 64 bits"),
+        ({"betas": (0.9,)}, "state.betas is a tuple of 1, not a tuple of 2"),
+        ({"betas": (0.9, None)}, "state.betas.1 is NoneType, not a number"),
+        ({"groups": [{"lr": []}]}, "state.groups.0.lr is a list, not a number"),
+        (
+            {"reward": np.zeros((2, 1))},
+            "state.reward is an array of 2 axes of float64, not an array of 1 axis of float64",
+        ),
+        (
+            {"weights": torch.zeros(2, 3).double()},
+            "state.weights is an array of 2 axes of float64, not an array of 2 axes of float32",
+        ),
+    ],
+)
+def test_a_state_of_another_kind_is_told_from_ones_own(given: Any, expected: str | None) -> None:
+    assert mismatch(given, OWN) == expected
