@@ -9,6 +9,7 @@ misread.
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -29,6 +30,9 @@ MOST_VALUES = 100_000
 """Of a run file, aliases and merges written out: they can grow to billions from a few lines."""
 DEEPEST = 100
 """Mappings and lists within each other: whatever walks through them may do so by recursion."""
+LARGEST_INTEGER = 2**63 - 1
+MOST_DIGITS = 64
+"""Of a whole number, however many zeros it begins with. Python itself refuses thousands."""
 
 TAG = "tag:yaml.org,2002:"
 CORE_SCHEMA = (
@@ -265,14 +269,11 @@ class _Reader:
             }
         if isinstance(node, yaml.SequenceNode) and node.tag == f"{TAG}seq":
             return [self.plain(item, (*path, index), item) for index, item in enumerate(node.value)]
-        if isinstance(node, yaml.ScalarNode):
-            try:
-                return scalar(node)
-            except ValueError:
-                pass
-        kind = node.tag.removeprefix(TAG)
-        self.problem(node, path, f"a value of the type '{kind}' has no place in a run file")
-        return None
+        try:
+            return scalar(node)
+        except ValueError as error:
+            self.problem(node, path, str(error))
+            return None
 
     def pairs(self, node: yaml.MappingNode, path: KeyPath) -> list[tuple[yaml.Node, yaml.Node]]:
         """Keys, which are checked, and values, with merge keys (`<<`) resolved."""
@@ -290,8 +291,10 @@ class _Reader:
             if key.tag == f"{TAG}merge":
                 continue
             if key.tag != f"{TAG}str":
-                written = shown(scalar(key)) if isinstance(key, yaml.ScalarNode) else "this"
+                written = key.value[:60] if isinstance(key, yaml.ScalarNode) else "this"
                 self.problem(key, path, f"a key must be text, not {written}; quote it")
+            elif not _has_bytes(key.value):
+                self.problem(key, path, HALF_A_CHARACTER)
             elif key.value in first:
                 earlier = self.place(first[key.value])
                 message = f"duplicate key, first at {earlier}; remove one"
@@ -319,25 +322,52 @@ def _extent(node: yaml.Node, known: dict[int, tuple[int, int]]) -> tuple[int, in
     return known[id(node)]
 
 
-def scalar(node: yaml.ScalarNode) -> str | int | float | bool | None:
-    """Convert a scalar by its tag; ValueError for a tag outside the core schema."""
-    text = node.value
-    match node.tag.removeprefix(TAG):
+HALF_A_CHARACTER = "has half a character (a surrogate) in it, which no file can hold"
+
+
+def scalar(node: yaml.Node) -> str | int | float | bool | None:
+    """Convert a scalar by its tag; ValueError, with what is wrong, where that can't be."""
+    kind, text = node.tag.removeprefix(TAG), node.value
+    pattern = _PATTERNS.get(kind, ".*")
+    fits = isinstance(node, yaml.ScalarNode) and re.fullmatch(pattern, text, re.DOTALL)
+    match kind if fits else None:
         case "str":
+            if not _has_bytes(text):
+                raise ValueError(HALF_A_CHARACTER)
             return str(text)
         case "null":
             return None
-        case "bool" if text.lower() in ("true", "false"):
+        case "bool":
             return bool(text.lower() == "true")
         case "int":
-            return int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
+            return _whole_number(text)
         case "float":
             # Python writes infinity and NaN without YAML's dot.
             number = float(re.sub(r"\.(inf|nan)", r"\1", text.lower()))
             exact = number.is_integer() and abs(number) < LARGEST_EXACT_INTEGER
             # 5e6 is a whole number, as in `max_steps: 5e6`; 5.0 is not.
             return int(number) if exact and "e" in text.lower() else number
-    raise ValueError(f"the tag {node.tag} is outside the core schema")
+    raise ValueError(f"a value of the type '{kind}' has no place in a run file")
+
+
+_PATTERNS = {kind: pattern for kind, pattern, _ in CORE_SCHEMA}
+
+
+def _whole_number(text: str) -> int:
+    base = {"0o": 8, "0x": 16}.get(text[:2], 10)
+    number = int(text, base) if len(text) <= MOST_DIGITS else math.inf
+    if abs(number) > LARGEST_INTEGER:
+        raise ValueError(f"should be within +-{LARGEST_INTEGER}, not {shown(text)}")
+    return int(number)
+
+
+def _has_bytes(text: str) -> bool:
+    """Whether text can be written; half of a pair of surrogates, by an escape, can not."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def dump(data: Any) -> str:

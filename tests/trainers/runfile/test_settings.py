@@ -21,7 +21,7 @@ from trainers.common.trainer_settings import TrainerSettings
 from trainers.hookspecs import hookimpl
 from trainers.runfile.registry import Registries, load_registries, plugin_manager
 from trainers.runfile.settings import RunSettings, SettingsError, dump_yaml, load_run, resolved
-from trainers.runfile.yaml_document import dump, parse
+from trainers.runfile.yaml_document import LARGEST_INTEGER, dump, parse
 
 
 class Model(BaseModel, frozen=True, extra="forbid"):
@@ -253,7 +253,9 @@ class TestGood:
 TEXT = st.text(st.characters(codec="utf-8")) | st.sampled_from(
     ["1e-3", "yes", "010", "0o7", "<<", "null", "", "=", "1:30", ".inf", "- a", "# b", "\x85"]
 )
-NUMBERS = st.floats(allow_nan=False, allow_infinity=False) | st.integers()
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False) | st.integers(
+    -LARGEST_INTEGER, LARGEST_INTEGER
+)
 PLAIN = st.recursive(
     st.none() | st.booleans() | NUMBERS | TEXT,
     lambda inner: st.lists(inner) | st.dictionaries(TEXT, inner),
@@ -375,11 +377,47 @@ class TestUnreadable:
         assert "a key must be text" in refused("? [a]\n: b\n")[0]
 
     @pytest.mark.parametrize(
-        "value", ["!!python/object/apply:os.getcwd []", "!own 3", "!!int many", "!!set {a}"]
+        "value",
+        [
+            *("!!python/object/apply:os.getcwd []", "!own 3", "!!int many", "!!set {a}"),
+            *("!!null no", "!!bool yes", "!!float [1]", "!!str {a: 1}", "<<"),
+        ],
     )
     def test_tags_outside_the_core_schema(self, value: str) -> None:
         (line,) = refused(f"seed: {value}\n")
         assert line.startswith("run.yaml:1: seed: a value of the type '")
+
+    def test_tags_of_keys(self) -> None:
+        assert refused(SMALL + "  !own a: 3\n  ? !!set {b}\n  : 4\n")[:2] == [
+            "run.yaml:5: trainer: a key must be text, not a; quote it",
+            "run.yaml:6: trainer: a key must be text, not this; quote it",
+        ]
+
+    @pytest.mark.parametrize(
+        ("number", "written"),
+        [
+            ("9223372036854775808", "'9223372036854775808'"),
+            ("-9223372036854775808", "'-9223372036854775808'"),
+            ("0x8000000000000000", "'0x8000000000000000'"),
+            ("1" + 309 * "0", "'1" + 55 * "0" + "..."),  # infinite as a float
+            (5000 * "9", "'" + 56 * "9" + "..."),  # more digits than Python reads
+            ("0x" + 5000 * "f", "'0x" + 54 * "f" + "..."),
+        ],
+        ids=["a bit more", "below", "hexadecimal", "infinite", "thousands", "hex thousands"],
+    )
+    def test_whole_numbers_have_64_bits(self, number: str, written: str) -> None:
+        expected = f"should be within +-9223372036854775807, not {written}"
+        for key in ("seed", "rewards"):
+            assert refused(f"{key}: {number}\n")[0] == f"run.yaml:1: {key}: {expected}"
+
+    def test_the_largest_whole_numbers(self) -> None:
+        assert parse("[9223372036854775807, -9223372036854775807]", "x").data == [
+            *(2**63 - 1, 1 - 2**63)
+        ]
+
+    def test_half_a_character(self) -> None:
+        assert refused('device: "\\ud83d"\n')[0].startswith("run.yaml:1: device: has half a char")
+        assert "half a character" in refused('"\\ud83d": 1\n')[0]
 
     def test_an_alias_that_contains_itself(self) -> None:
         assert refused("seed: &all [*all]\n") == [
