@@ -5,14 +5,15 @@ So rows of a batch can be filled in any order, by any number of threads, and com
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from envs.grasp.compiled import compiled
 
 PARITY = np.uint32(0x1BD11BDA)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _mixed(x: np.uint32, y: np.uint32, turn: int) -> tuple[np.uint32, np.uint32]:
     """One round: add, rotate by `turn` bits, exclusive or."""
     total = np.uint32(x + y)
@@ -20,7 +21,7 @@ def _mixed(x: np.uint32, y: np.uint32, turn: int) -> tuple[np.uint32, np.uint32]
     return total, np.uint32(turned ^ total)
 
 
-@numba.njit(cache=True)
+@compiled()
 def threefry(
     key: tuple[np.uint32, np.uint32], counter: tuple[np.uint32, np.uint32]
 ) -> tuple[np.uint32, np.uint32]:
@@ -51,7 +52,7 @@ def threefry(
     return x, y
 
 
-@numba.njit(cache=True)
+@compiled()
 def uniform(stream: NDArray[np.uint64], low: float, high: float) -> float:
     """The stream's next number, uniform in [low, high).
 

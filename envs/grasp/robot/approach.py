@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from envs.grasp.compiled import compiled
 from envs.grasp.robot.kinematics import ArmLengths, arm_lengths, solve_frame, within
 from envs.grasp.robot.paths import Floats, Path
 from envs.grasp.robot.urdf import Robot
@@ -72,7 +72,7 @@ class Approach:
         return ways, length_m
 
 
-@numba.njit(cache=True)
+@compiled()
 def _solve(
     arm: ArmLengths,
     last_link: np.ndarray,
@@ -108,7 +108,7 @@ def _solve(
                 way[knot, joint] = min(max(way[knot, joint], lower[joint]), upper[joint])
 
 
-@numba.njit(cache=True)
+@compiled()
 def _reach(
     arm: ArmLengths,
     last_link: np.ndarray,

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from envs.grasp.compiled import compiled
 from envs.grasp.robot.urdf import Primitive, Robot
 
 _AXES = ((0, 0, -1), (0, 1, 0), (0, 1, 0), (-1, 0, 0), (0, 1, 0), (-1, 0, 0))
@@ -200,7 +200,7 @@ def arm_lengths(robot: Robot) -> ArmLengths:
     )
 
 
-@numba.njit(cache=True)
+@compiled()
 def _solve(
     arm: ArmLengths, frames: np.ndarray, joints: np.ndarray, near_enough: np.ndarray
 ) -> None:
@@ -212,7 +212,7 @@ def _solve(
         near_enough[row] = solve_frame(arm, frames[row], joints[row])
 
 
-@numba.njit(cache=True)
+@compiled()
 def solve_frame(arm: ArmLengths, frame: np.ndarray, joints: np.ndarray) -> bool:
     """Writes the joints (6,) that bring the last link to a frame (4, 4).
 
@@ -223,7 +223,7 @@ def solve_frame(arm: ArmLengths, frame: np.ndarray, joints: np.ndarray) -> bool:
     return near_enough
 
 
-@numba.njit(cache=True)
+@compiled()
 def within(joints: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> bool:
     """Whether joints (J,) are within their limits, but for rounding."""
     for joint in range(len(joints)):
@@ -232,7 +232,7 @@ def within(joints: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> bool:
     return True
 
 
-@numba.njit(cache=True)
+@compiled()
 def _place_wrist(arm: ArmLengths, centre: np.ndarray, joints: np.ndarray) -> bool:
     """Writes A1, A2, A3 for the wrist's centre (3,); False if it is too far or too near."""
     reach, rise = math.hypot(centre[0], centre[1]) - arm.shoulder, centre[2] - arm.height
@@ -248,7 +248,7 @@ def _place_wrist(arm: ArmLengths, centre: np.ndarray, joints: np.ndarray) -> boo
     return abs(cosine) <= 1.0 + _SLACK
 
 
-@numba.njit(cache=True)
+@compiled()
 def _turn_wrist(frame: np.ndarray, joints: np.ndarray) -> None:
     """Writes A4, A5, A6, with A5 <= 0, for a last link's frame (4, 4), given A1, A2 and A3.
 

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from envs.grasp.compiled import compiled
 
 Floats = NDArray[np.float64]
 
@@ -29,7 +30,7 @@ L_LEG_SHARE = (0.5, 0.6)
 U_LEG_SHARE = (0.25, 0.35)
 
 
-@numba.njit(cache=True)
+@compiled()
 def largest_corner_disc(leg_m: float, bar_m: float) -> float:
     """Radius of the largest disc where a leg and a bar meet at a right angle.
 
@@ -43,7 +44,7 @@ def largest_corner_disc(leg_m: float, bar_m: float) -> float:
     return float(leg_m + bar_m - math.sqrt(2.0 * leg_m * bar_m))
 
 
-@numba.njit(cache=True)
+@compiled()
 def build_block(
     shape: int,
     size_m: Floats,

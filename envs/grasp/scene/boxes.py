@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from envs.grasp.compiled import compiled
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float, float]
@@ -21,13 +22,13 @@ class Boxes(NamedTuple):
     half_m: Floats
 
 
-@numba.njit(cache=True)
+@compiled()
 def part(boxes: Boxes, begin: int, end: int) -> Boxes:
     """The boxes from `begin` to `end`."""
     return Boxes(boxes.center_m[begin:end], boxes.rotation[begin:end], boxes.half_m[begin:end])
 
 
-@numba.njit(cache=True)
+@compiled()
 def put(
     boxes: Boxes, box: int, center_m: Point, half_m: Point, yaw_rad: float, pitch_rad: float
 ) -> None:
@@ -42,7 +43,7 @@ def put(
         boxes.center_m[box, axis], boxes.half_m[box, axis] = center_m[axis], half_m[axis]
 
 
-@numba.njit(cache=True)
+@compiled()
 def move(boxes: Boxes, position_m: Floats, yaw_rad: float) -> None:
     """Turns boxes about the origin's vertical, then moves them there."""
     cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
@@ -57,13 +58,13 @@ def move(boxes: Boxes, position_m: Floats, yaw_rad: float) -> None:
             boxes.rotation[box, 1, column] = sine * x + cosine * y
 
 
-@numba.njit(cache=True)
+@compiled()
 def clear(boxes: Boxes) -> None:
     """Takes boxes away."""
     boxes.center_m[:], boxes.rotation[:], boxes.half_m[:] = 0.0, 0.0, 0.0
 
 
-@numba.njit(cache=True)
+@compiled()
 def outline(boxes: Boxes) -> tuple[Floats, Floats]:
     """The ends (3,) of the room that boxes take."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -79,7 +80,7 @@ def outline(boxes: Boxes) -> tuple[Floats, Floats]:
     return low, high
 
 
-@numba.njit(cache=True)
+@compiled()
 def shows(boxes: Boxes, camera_m: Floats, points_m: Floats) -> bool:
     """Whether every camera sees all of some points past boxes."""
     for box in range(len(boxes.half_m)):
@@ -92,7 +93,7 @@ def shows(boxes: Boxes, camera_m: Floats, points_m: Floats) -> bool:
     return True
 
 
-@numba.njit(cache=True)
+@compiled()
 def _crosses(boxes: Boxes, box: int, start_m: Floats, end_m: Floats) -> bool:
     """Whether a box has a point of a straight line, by the part of it between its faces."""
     enter, leave = 0.0, 1.0

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.grasp.compiled import compiled
 from envs.grasp.scene.boxes import Boxes, clear, put, shows
 from envs.grasp.scene.table_top import TableTop, take
 from envs.grasp.threefry import uniform
@@ -21,7 +21,7 @@ BEND_RAD = SWING_RAD = math.radians(25.0)
 TRIES = 50
 
 
-@numba.njit(cache=True)
+@compiled()
 def draw_cable(
     stream: Stream,
     thickness_m: Floats,
@@ -55,7 +55,7 @@ def draw_cable(
     clear(boxes)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _begin_anywhere(stream: Stream, table: TableTop, end: Floats) -> int:
     """Begins a cable on the table: writes x, y and the heading of its free end."""
     for axis in range(2):
@@ -64,7 +64,7 @@ def _begin_anywhere(stream: Stream, table: TableTop, end: Floats) -> int:
     return 0
 
 
-@numba.njit(cache=True)
+@compiled()
 def _hang(stream: Stream, table: TableTop, boxes: Boxes, half_m: float, end: Floats) -> int:
     """Hangs two boxes of a cable over a side of the table or its far edge.
 
@@ -91,7 +91,7 @@ def _hang(stream: Stream, table: TableTop, boxes: Boxes, half_m: float, end: Flo
     return 2
 
 
-@numba.njit(cache=True)
+@compiled()
 def _lay(
     stream: Stream,
     boxes: Boxes,

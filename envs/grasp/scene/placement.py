@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.grasp.compiled import compiled
 from envs.grasp.scene.blocks import MAX_BAR_SHARE, MIN_BAR_M, SHAPE_CODES, build_block
 from envs.grasp.sensors.camera import sampling
 from envs.grasp.settings import GraspSettings
@@ -65,7 +65,7 @@ def rules(settings: GraspSettings) -> Rules:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def place_blocks(
     rules: Rules,
     streams: NDArray[np.uint64],
@@ -127,7 +127,7 @@ def place_blocks(
                 break
 
 
-@numba.njit(cache=True)
+@compiled()
 def _draw_scene(
     stream: Stream,
     rules: Rules,
@@ -152,7 +152,7 @@ def _draw_scene(
     )
 
 
-@numba.njit(cache=True)
+@compiled()
 def _draw_positions(stream: Stream, rules: Rules, position_m: Floats) -> bool:
     """Draws where the blocks stand, by rising distance; False if the first is not ahead enough."""
     count = len(position_m)
@@ -172,7 +172,7 @@ def _draw_positions(stream: Stream, rules: Rules, position_m: Floats) -> bool:
     return math.hypot(position_m[1, 0], position_m[1, 1]) - first >= rules.lead_m
 
 
-@numba.njit(cache=True)
+@compiled()
 def _draw_yaws(stream: Stream, rules: Rules, limit_rad: float, yaw_rad: Floats) -> None:
     low = min(max(rules.yaw_rad[0], -limit_rad), limit_rad)
     high = min(max(rules.yaw_rad[1], -limit_rad), limit_rad)
@@ -180,7 +180,7 @@ def _draw_yaws(stream: Stream, rules: Rules, limit_rad: float, yaw_rad: Floats) 
         yaw_rad[block] = uniform(stream, low, high)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _draw_block(
     stream: Stream, rules: Rules, size_m: Floats, center_m: Floats, half_m: Floats
 ) -> tuple[float, float]:
@@ -197,7 +197,7 @@ def _draw_block(
     return (centroid_y, centroid_z) if rules.grasp_at_centroid else (disc_y, disc_z)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _to_world(
     x: float, y: float, z: float, position_m: Floats, yaw_rad: float, point_m: Floats
 ) -> None:
@@ -208,7 +208,7 @@ def _to_world(
     point_m[2] = position_m[2] + z
 
 
-@numba.njit(cache=True)
+@compiled()
 def _reachable(rules: Rules, target_m: Floats, yaw_rad: float) -> bool:
     for axis in range(3):
         if not rules.workspace_low[axis] <= target_m[axis] <= rules.workspace_high[axis]:
@@ -216,7 +216,7 @@ def _reachable(rules: Rules, target_m: Floats, yaw_rad: float) -> bool:
     return rules.workspace_low[3] <= yaw_rad <= rules.workspace_high[3]
 
 
-@numba.njit(cache=True)
+@compiled()
 def footprint(
     size_m: Floats, position_m: Floats, yaw_rad: float, grow_m: float, corners_m: Floats
 ) -> None:
@@ -229,7 +229,7 @@ def footprint(
     _to_world(near, side, 0.0, position_m, yaw_rad, corners_m[3])
 
 
-@numba.njit(cache=True)
+@compiled()
 def _apart_on_support(rules: Rules, size_m: Floats, position_m: Floats, yaw_rad: Floats) -> bool:
     """Whether all blocks stand wholly on the support, and well apart."""
     count = len(size_m)
@@ -253,7 +253,7 @@ def _apart_on_support(rules: Rules, size_m: Floats, position_m: Floats, yaw_rad:
     return True
 
 
-@numba.njit(cache=True)
+@compiled()
 def separated(first_m: Floats, second_m: Floats, yaw_rad: float) -> bool:
     """Whether a line along or across `yaw` separates two rectangles (4, 3) seen from above."""
     for angle in (yaw_rad, yaw_rad + math.pi / 2):
@@ -270,7 +270,7 @@ def separated(first_m: Floats, second_m: Floats, yaw_rad: float) -> bool:
     return False
 
 
-@numba.njit(cache=True)
+@compiled()
 def _seen(
     rules: Rules,
     size_m: Floats,

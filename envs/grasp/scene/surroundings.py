@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.grasp.compiled import compiled
 from envs.grasp.scene.blocks import DISC_RADIUS_M
 from envs.grasp.scene.boxes import Boxes, clear, move, outline, part, put, shows
 from envs.grasp.scene.cable import CABLE_BOXES, draw_cable
@@ -85,7 +85,7 @@ def surrounding_rules(settings: GraspSettings, surroundings: Surroundings) -> Su
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def surround(
     rules: SurroundingRules,
     streams: NDArray[np.uint64],
@@ -145,7 +145,7 @@ def surround(
             draw_cable(stream, rules.cable_m, cable, table, count, camera_m[row], disc)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _draw_far(stream: Stream, rules: SurroundingRules, boxes: Boxes) -> None:
     """Draws the floor, what stands behind the table, and what carries it."""
     if uniform(stream, 0.0, 1.0) < rules.floor:
@@ -163,7 +163,7 @@ def _draw_far(stream: Stream, rules: SurroundingRules, boxes: Boxes) -> None:
         )
 
 
-@numba.njit(cache=True)
+@compiled()
 def _draw_frame(stream: Stream, rules: SurroundingRules, boxes: Boxes) -> None:
     """Four legs under the table's top, and an apron before and behind."""
     low, high, under = rules.table_low_m, rules.table_high_m, rules.table_low_m[2]
@@ -179,7 +179,7 @@ def _draw_frame(stream: Stream, rules: SurroundingRules, boxes: Boxes) -> None:
         box += 1
 
 
-@numba.njit(cache=True)
+@compiled()
 def _draw_backdrop(stream: Stream, rules: SurroundingRules, boxes: Boxes, is_wall: bool) -> None:
     """A wall, or a rack of four posts and two shelves, wholly behind the table's far side."""
     yaw = uniform(stream, rules.yaw_rad[0], rules.yaw_rad[1])
@@ -203,7 +203,7 @@ def _draw_backdrop(stream: Stream, rules: SurroundingRules, boxes: Boxes, is_wal
     move(boxes, place, yaw)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _write_disc(target_m: Floats, yaw_rad: float, points_m: Floats) -> None:
     """Writes the centre and the rim of the grasp disc on the target's face."""
     for point in range(len(points_m)):
@@ -214,7 +214,7 @@ def _write_disc(target_m: Floats, yaw_rad: float, points_m: Floats) -> None:
         points_m[point, 2] = target_m[2] + radius * math.sin(angle)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _draw_things(
     stream: Stream,
     rules: SurroundingRules,
@@ -239,7 +239,7 @@ def _draw_things(
     return count
 
 
-@numba.njit(cache=True)
+@compiled()
 def _settle(stream: Stream, boxes: Boxes, table: TableTop, count: int) -> bool:
     """Puts a thing somewhere on the table, any way round; False where that is taken."""
     low, high = outline(boxes)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.grasp.compiled import compiled
 from envs.grasp.scene.placement import footprint, separated
 
 Floats = NDArray[np.float64]
@@ -35,7 +35,7 @@ class TableTop(NamedTuple):
     yaw_rad: Floats
 
 
-@numba.njit(cache=True)
+@compiled()
 def take_block(
     table: TableTop,
     place: int,
@@ -50,7 +50,7 @@ def take_block(
     table.yaw_rad[place] = yaw_rad
 
 
-@numba.njit(cache=True)
+@compiled()
 def take_corridor(table: TableTop, place: int, target_m: Floats, yaw_rad: float) -> None:
     """Takes the way of the tool: it comes from the robot's side along the face's normal."""
     size = np.array([CORRIDOR_LENGTH_M + CORRIDOR_BEYOND_M, 2.0 * CORRIDOR_HALF_M, 0.0])
@@ -61,7 +61,7 @@ def take_corridor(table: TableTop, place: int, target_m: Floats, yaw_rad: float)
     table.yaw_rad[place] = yaw_rad
 
 
-@numba.njit(cache=True)
+@compiled()
 def take(table: TableTop, count: int, size_m: Floats, position_m: Floats, yaw_rad: float) -> bool:
     """Takes a rectangle as number `count`, unless it meets one before or is partly off the table.
 

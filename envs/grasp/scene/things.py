@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.grasp.compiled import compiled
 from envs.grasp.scene.boxes import Boxes, put
 from envs.grasp.threefry import uniform
 
@@ -31,7 +31,7 @@ SMALL_SHARE = 0.6
 TALLEST_M = 0.35
 
 
-@numba.njit(cache=True)
+@compiled()
 def draw_thing(
     stream: Stream, kinds: NDArray[np.int64], block_size_m: Floats, boxes: Boxes
 ) -> None:
@@ -54,7 +54,7 @@ def draw_thing(
         _draw_box(stream, block_size_m, boxes, kind)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _draw_beams(stream: Stream, block_size_m: Floats, boxes: Boxes, kind: int) -> None:
     """A T, upright or on its head, or a cross: a thin upright and a beam across its middle line."""
     low, high = block_size_m
@@ -67,7 +67,7 @@ def _draw_beams(stream: Stream, block_size_m: Floats, boxes: Boxes, kind: int) -
     put(boxes, 1, (0.0, 0.0, across), (depth, width, thick), 0.0, 0.0)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _draw_column(stream: Stream, block_size_m: Floats, boxes: Boxes) -> None:
     """A hexagonal column: three boxes about one axis, each with two opposite sides of it."""
     inner = SMALL_SHARE * block_size_m[0] * uniform(stream, 0.4, 0.8)
@@ -77,7 +77,7 @@ def _draw_column(stream: Stream, block_size_m: Floats, boxes: Boxes) -> None:
         put(boxes, box, (0.0, 0.0, height), half, box * math.pi / 3, 0.0)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _draw_tilted(stream: Stream, boxes: Boxes) -> None:
     """A box on one of its edges: no face of it is upright, but for the ends."""
     depth, height = uniform(stream, 0.02, 0.05), uniform(stream, 0.04, 0.08)
@@ -86,7 +86,7 @@ def _draw_tilted(stream: Stream, boxes: Boxes) -> None:
     put(boxes, 0, (0.0, 0.0, up), (depth, width, height), 0.0, pitch)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _draw_box(stream: Stream, block_size_m: Floats, boxes: Boxes, kind: int) -> None:
     """A plate, a post, a cube or a slab: upright boxes, all of whose faces have a small side."""
     low, high = block_size_m

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from envs.grasp.compiled import compiled
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -17,10 +18,9 @@ Vector = tuple[float, float, float]
 
 
 def kernel(*, counts: bool = True, **options: Any) -> Callable[..., Callable[..., Any]]:
-    """A decorator that compiles a function at its first call, and keeps that for the next process.
+    """A decorator that compiles a function; see `envs.grasp.compiled`.
 
-    A division by zero is infinite, not an exception, which would be a branch in every loop. What is
-    kept of a kernel is renewed when its own file changes, but not when a file it imports from does.
+    A division by zero is infinite, not an exception, which would be a branch in every loop.
 
     Every array that is sliced or given to a function costs two atomic additions, to its counter of
     references, and a tuple of arrays as many as it has: inner loops are given single arrays only,
@@ -31,9 +31,7 @@ def kernel(*, counts: bool = True, **options: Any) -> Callable[..., Callable[...
             functions that hold the arrays it is given.
         options: more of `numba.njit`'s.
     """
-    options = {"cache": True, "error_model": "numpy", "_nrt": counts, **options}
-    decorator: Callable[[Callable[..., Any]], Callable[..., Any]] = njit(**options)
-    return decorator
+    return compiled(error_model="numpy", _nrt=counts, **options)
 
 
 class RobotArrays(NamedTuple):
