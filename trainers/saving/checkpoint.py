@@ -287,7 +287,7 @@ class Checkpoints:
             if match[2] == "old" and not final.exists():
                 path.rename(final)
             else:
-                shutil.rmtree(path)
+                _remove(path)
 
     def _write_manifest(self, folder: Path, step: int, score: float | None, score_of: str) -> None:
         """Describe the folder's files in its manifest and put everything on the disk."""
@@ -323,7 +323,7 @@ class Checkpoints:
                 # Renamed first, so that an interrupted removal doesn't look like a damaged one.
                 doomed = self.directory / f".step-{match[1]}.tmp-{secrets.token_hex(4)}"
                 path.rename(doomed)
-                shutil.rmtree(doomed)
+                _remove(doomed)
 
     def _mark(self, name: str, entry: CheckpointInfo) -> None:
         content = {"step": entry.step, "checkpoint": entry.path.name, "score": entry.score}
@@ -400,13 +400,21 @@ def _write_safetensors(path: Path, content: Any, *, torch_tensors: bool = False)
 def _move_into_place(temporary: Path, path: Path) -> None:
     """Rename a finished folder; what was there is put aside first, and removed last."""
     aside = None
-    if path.exists():
+    if os.path.lexists(path):
         aside = path.with_name(f".{path.name}.old-{secrets.token_hex(4)}")
         path.rename(aside)
     temporary.rename(path)
     sync(path.parent)
     if aside:
-        shutil.rmtree(aside)
+        _remove(aside)
+
+
+def _remove(folder: Path) -> None:
+    """Removes a checkpoint; of one that a link leads to, the link alone."""
+    if folder.is_symlink():
+        folder.unlink()
+    else:
+        shutil.rmtree(folder)
 
 
 def _digest(path: Path) -> str:

@@ -333,6 +333,26 @@ def test_other_files_and_folders_are_left_alone(tmp_path: Path) -> None:
     assert "step-100" not in names(tmp_path)
 
 
+def test_checkpoints_behind_links_are_read_pruned_and_replaced(tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (tmp_path / "linked").symlink_to(elsewhere)
+    checkpoints = Checkpoints(tmp_path / "linked", keep=1)
+    for step in (1, 2):
+        save(checkpoints, step)
+        (elsewhere / f"step-{step}").rename(tmp_path / f"moved-{step}")
+        (elsewhere / f"step-{step}").symlink_to(tmp_path / f"moved-{step}")
+    assert checkpoints.load_latest().step == 2
+    assert not (elsewhere / "step-1").is_symlink()  # the second save pruned it
+    save(checkpoints, 2)
+    assert not (elsewhere / "step-2").is_symlink()
+    assert names(elsewhere) == ["best.json", "latest.json", "step-2"]
+    assert names(tmp_path) == ["elsewhere", "linked", "moved-1", "moved-2"]
+    (elsewhere / "step-3").symlink_to(tmp_path / "nowhere")
+    assert save(checkpoints, 3).is_dir()
+    assert Checkpoints.load(tmp_path / "moved-1").step == 1
+
+
 def test_a_failed_save_leaves_nothing_and_names_the_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
