@@ -46,7 +46,8 @@ class Curriculum(Protocol):
     """Chooses the environment's parameters from how the training goes.
 
     A curriculum keeps nothing in itself: the state goes into the checkpoint, and a run that reads
-    it back goes on exactly.
+    it back goes on exactly. It may have a method `all_parameters()`, too, of the environment
+    parameters of each lesson: all of them are checked before a run begins.
     """
 
     @property

@@ -63,7 +63,7 @@ class LessonsSettings(BaseModel, frozen=True, extra="forbid"):
         "episodes; without effect on progress.",
     )
     count: int | None = Field(
-        default=None, ge=1, description="Compact form: the number of lessons."
+        default=None, ge=1, le=10_000, description="Compact form: the number of lessons."
     )
     thresholds: Interpolation | None = Field(
         default=None, description="Compact form: the thresholds of all lessons but the last."

@@ -21,6 +21,7 @@ The same one by one, where parameters may be samplers and lessons may have names
 """
 
 from collections import deque
+from collections.abc import Iterator
 from fractions import Fraction
 
 from curricula.curriculum import FinishedEpisodes, State
@@ -97,6 +98,10 @@ class Lessons:
     def final_parameters(self) -> dict[str, ParameterValue]:
         """Environment parameters of the last lesson."""
         return dict(self._lessons[-1].parameters)
+
+    def all_parameters(self) -> Iterator[dict[str, ParameterValue]]:
+        """Environment parameters of each lesson."""
+        return (dict(lesson.parameters) for lesson in self._lessons)
 
     def _pass_thresholds(self, index: int, run_fraction: float) -> int:
         while (

@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 
 import torch
 from gymnasium.spaces import Box
-from pydantic import Field, PositiveInt
+from pydantic import Field
 from torch import nn
 
 from encoders.inputs import ImageSettings, image_input
-from encoders.layers import Activation, ConvLayer, convolutions, feature_map_area
+from encoders.layers import Activation, ConvLayer, Size, convolutions, feature_map_area
 
 _FIRST_80: tuple[ConvLayer, ...] = ((16, 8, 4), (32, 4, 2))
 _FIRST_128: tuple[ConvLayer, ...] = (*_FIRST_80, (64, 2, 1))
@@ -70,7 +70,7 @@ class Conv(ConvolutionalEncoder):
         """Settings of the encoder ``conv``."""
 
         layers: Annotated[
-            tuple[tuple[PositiveInt, PositiveInt, PositiveInt], ...],
+            tuple[tuple[Size, Size, Size], ...],
             Field(
                 min_length=1,
                 description="Convolutions from the image inwards, each [filters, kernel, stride].",

@@ -7,11 +7,11 @@ from typing import Literal
 
 import torch
 from gymnasium.spaces import Box
-from pydantic import BaseModel, Field, PositiveInt
+from pydantic import BaseModel, Field
 from torch import nn
 
 from encoders.inputs import fill_gaps
-from encoders.layers import dense
+from encoders.layers import Size, dense
 from encoders.points import (
     ATTENTION_GAIN,
     COORDINATES,
@@ -50,13 +50,11 @@ class Keypoints(PointEncoder):
     class Settings(BaseModel, frozen=True, extra="forbid"):
         """Settings of the encoder ``keypoints``."""
 
-        keypoints: PositiveInt = Field(24, description="Attention maps, each with a keypoint.")
+        keypoints: Size = Field(24, description="Attention maps, each with a keypoint.")
         patch: int = Field(8, ge=2, description="Side of a patch in pixels.")
-        stride: PositiveInt = Field(4, description="Pixels from one patch to the next.")
-        hidden_units: PositiveInt = Field(
-            48, description="Units of the two layers that describe a patch."
-        )
-        values: PositiveInt = Field(
+        stride: Size = Field(4, description="Pixels from one patch to the next.")
+        hidden_units: Size = Field(48, description="Units of the two layers that describe a patch.")
+        values: Size = Field(
             8, description="Learned features that a keypoint gathers beside its place."
         )
         precision: Literal["float32", "bfloat16"] = Field(

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 from gymnasium.spaces import Box
+from pydantic import Field
 from torch import nn
 
 Activation = Literal["relu", "elu", "leaky_relu", "tanh"]
 ConvLayer = tuple[int, int, int]
 """Filters, kernel (pixels), stride (pixels)."""
+Size = Annotated[int, Field(ge=1, le=2**16)]
+"""Settings: a width, a number of filters, a length in pixels."""
+Depth = Annotated[int, Field(ge=1, le=100)]
+"""Settings: a number of layers."""
 Window = tuple[int, int]
 """Kernel and stride (pixels) of anything that slides over an image without padding."""
 

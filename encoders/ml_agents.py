@@ -10,18 +10,18 @@ from collections.abc import Sequence
 
 import torch
 from gymnasium.spaces import Box
-from pydantic import Field, PositiveInt
+from pydantic import Field
 from torch import nn
 
 from encoders.conv import ConvolutionalEncoder
 from encoders.inputs import ImageSettings, image_input, vector_input
-from encoders.layers import ConvLayer, dense, feature_map_area
+from encoders.layers import ConvLayer, Depth, Size, dense, feature_map_area
 
 
 class FeatureSettings(ImageSettings, frozen=True, extra="forbid"):
     """Settings of an encoder that ends in one dense layer."""
 
-    features: PositiveInt = Field(256, description="Width of the dense layer the encoder ends in.")
+    features: Size = Field(256, description="Width of the dense layer the encoder ends in.")
 
 
 class _ConvolutionsAndDense(nn.Module):
@@ -137,8 +137,8 @@ class FullyConnected(nn.Module):
     class Settings(ImageSettings, frozen=True, extra="forbid"):
         """Settings of the encoder ``fully_connected``."""
 
-        num_layers: PositiveInt = Field(1, description="Number of dense layers.")
-        hidden_units: PositiveInt = Field(256, description="Width of each dense layer.")
+        num_layers: Depth = Field(1, description="Number of dense layers.")
+        hidden_units: Size = Field(256, description="Width of each dense layer.")
 
     def __init__(self, space: Box, settings: Settings) -> None:
         super().__init__()

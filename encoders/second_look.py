@@ -7,11 +7,11 @@ from typing import Literal
 
 import torch
 from gymnasium.spaces import Box
-from pydantic import BaseModel, Field, PositiveInt
+from pydantic import BaseModel, Field
 from torch import nn
 
 from encoders.inputs import nearest_surfaces
-from encoders.layers import dense
+from encoders.layers import Size, dense
 from encoders.points import (
     ATTENTION_GAIN,
     COORDINATES,
@@ -61,24 +61,22 @@ class SecondLook(PointEncoder):
     class Settings(BaseModel, frozen=True, extra="forbid"):
         """Settings of the encoder ``second_look``."""
 
-        cell: PositiveInt = Field(5, description="Side of a cell in pixels.")
+        cell: Size = Field(5, description="Side of a cell in pixels.")
         surface_m: float = Field(
             0.03, gt=0.0, description="Pixels of a cell's surface lie so far from its nearest."
         )
         patch: int = Field(5, ge=2, description="Side of a patch in cells.")
-        stride: PositiveInt = Field(2, description="Cells from one patch to the next.")
+        stride: Size = Field(2, description="Cells from one patch to the next.")
         clip_m: float = Field(
             0.05, gt=0.0, description="Depths in a patch count up to so far from its middle's."
         )
-        hidden_units: PositiveInt = Field(
-            96, description="Units of the two layers that describe a patch."
-        )
-        values: PositiveInt = Field(
+        hidden_units: Size = Field(96, description="Units of the two layers that describe a patch.")
+        values: Size = Field(
             16, description="Learned features that a keypoint gathers beside its place."
         )
-        first_keypoints: PositiveInt = Field(16, description="Attention maps of the first look.")
-        second_keypoints: PositiveInt = Field(24, description="Attention maps of the second look.")
-        query_units: PositiveInt = Field(
+        first_keypoints: Size = Field(16, description="Attention maps of the first look.")
+        second_keypoints: Size = Field(24, description="Attention maps of the second look.")
+        query_units: Size = Field(
             64, description="Units of the layer that turns the first look into queries."
         )
         precision: Literal["float32", "bfloat16"] = Field(

@@ -15,6 +15,7 @@ from curricula.curriculum import Curriculum, FinishedEpisodes, State
 from curricula.samplers import ParameterValue
 from encoders.spaces import bounded
 from envs.environment import Environment
+from envs.memory import shortage
 from rewards.reward import RewardTerm
 from trainers.algorithms.base import Algorithm
 from trainers.common.devices import resolve_device
@@ -31,6 +32,9 @@ from trainers.runfile.settings import Component, RunSettings
 from trainers.saving.resumable import ALGORITHM, Resumable
 
 _logger = logging.getLogger("ventosa")
+
+BYTES_PER_PARAMETER = 16
+"""A weight, its gradient and Adam's two moments, in float32."""
 
 
 class Session:
@@ -67,17 +71,18 @@ class Session:
         try:
             self._check_parameters(env)
             _warn_of_what_learns_badly(run, env)
+            factory = build_factory(run, registries, env)
+            _check_network_size(run, factory)
             torch.manual_seed(run.seed)
             generator = torch.Generator(device).manual_seed(run.seed)
             self.env_runner = EnvRunner(env, stop_requested)
             self.metadata = Metadata.of_run(run, registries, env)
-            factory = build_factory(run, registries, env)
             self.algorithm: Algorithm = run.trainer.cls(
                 factory, run.trainer.settings, self.env_runner, generator, device
             )
             with blaming_parameters():
-                # The last lesson's first, so that they are not refused hours later.
-                for parameters in (final_parameters(run), self._parameters_now()):
+                # Those of all lessons first, so that they are not refused hours later.
+                for parameters in (*self._lessons_ahead(), self._parameters_now()):
                     self.env_runner.set_parameters(parameters)
         except BaseException:
             env.close()
@@ -107,8 +112,15 @@ class Session:
         return RunPosition(self.env_runner.step_count, lesson, self.lesson_count)
 
     def reset(self) -> None:
-        """Begins the run's first episodes."""
-        self.env_runner.reset()
+        """Begins the run's first episodes.
+
+        Raises:
+            UserError: there can be none with the environment's settings.
+        """
+        try:
+            self.env_runner.reset()
+        except ValueError as error:
+            raise UserError(f"environment: {error}") from error
 
     def advance_curriculum(self, episodes: EpisodeBatch, run_fraction: float) -> bool:
         """Shows finished episodes to the curriculum; True if a new lesson begins.
@@ -165,6 +177,14 @@ class Session:
         )
         return {**self._parameters, **lesson}
 
+    def _lessons_ahead(self) -> Iterator[dict[str, ParameterValue]]:
+        """Environment parameters of all lessons, as far as the curriculum tells them."""
+        if self.curriculum is None:
+            return
+        every = getattr(self.curriculum, "all_parameters", None)
+        for lesson in every() if every else (self.curriculum.final_parameters(),):
+            yield {**self._parameters, **lesson}
+
     def _check_parameters(self, env: Environment) -> None:
         sources = {"environment_parameters": self._parameters}
         if self.curriculum is not None:
@@ -176,6 +196,25 @@ class Session:
                     f"{path}: the environment has no parameter {name!r}; "
                     f"{suggestion(name, env.parameter_names)}"
                 )
+
+
+def _check_network_size(run: RunSettings, factory: NetworkFactory) -> None:
+    """Refuses networks that the machine has no memory to train, before there are any.
+
+    Raises:
+        UserError: with how much they need.
+    """
+    with torch.device("meta"):  # where parameters have shapes and no values
+        try:
+            policy = run.trainer.cls.build_policy(factory, run.trainer.settings)
+        except RuntimeError:
+            return  # a plugin's networks, which look at values as they are built
+    count = sum(parameter.numel() for parameter in policy.parameters())
+    if lack := shortage(count * BYTES_PER_PARAMETER):
+        raise UserError(
+            f"trainer.network_settings and encoders: to train networks with {count:,} parameters "
+            f"{lack}: make hidden layers or encoders smaller"
+        )
 
 
 def _warn_of_what_learns_badly(run: RunSettings, env: Environment) -> None:

@@ -297,12 +297,18 @@ class Pick(BaseModel, frozen=True, extra="forbid"):
         0.5, ge=0.0, description="Of blocks and support each; PyBullet multiplies the two."
     )
     approach_s: float = Field(
-        0.5, gt=0.0, description="How long the straight way from the stand-off to the pose takes."
+        0.5,
+        gt=0.0,
+        le=60.0,
+        description="How long the straight way from the stand-off to the pose takes.",
     )
     advance_m: float = Field(
-        0.05, gt=0.0, description="How far the cup looks for the face from where it was sent."
+        0.05,
+        gt=0.0,
+        le=1.0,
+        description="How far the cup looks for the face from where it was sent.",
     )
-    advance_speed_m_s: float = Field(0.05, gt=0.0, description="Speed of the cup on that way.")
+    advance_speed_m_s: float = Field(0.05, ge=0.001, description="Speed of the cup on that way.")
     seal_m: float = Field(
         0.003, gt=0.0, description="The rim's largest distance to the face that still seals."
     )
@@ -312,9 +318,9 @@ class Pick(BaseModel, frozen=True, extra="forbid"):
         gt=0.0,
         description="Of the cup on the face. The face is upright: friction carries the weight.",
     )
-    lift_m: float = Field(0.2, gt=0.0, description="How far the block is lifted.")
-    lift_s: float = Field(1.0, gt=0.0, description="How long that takes.")
-    hold_s: float = Field(1.0, ge=0.0, description="How long the block is held up there.")
+    lift_m: float = Field(0.2, gt=0.0, le=2.0, description="How far the block is lifted.")
+    lift_s: float = Field(1.0, gt=0.0, le=60.0, description="How long that takes.")
+    hold_s: float = Field(1.0, ge=0.0, le=600.0, description="How long the block is held up there.")
 
 
 class GraspSettings(BaseModel, frozen=True, extra="forbid"):

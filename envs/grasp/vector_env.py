@@ -42,8 +42,12 @@ from envs.grasp.sensors.camera import CameraPoses, overviews
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.factory import make_simulator
 from envs.grasp.task import EpisodeProgress, GoalRegion, Motion, advance, judge
+from envs.memory import shortage, space_bytes
 from rewards.grasp.transition import GraspTransition
 from rewards.reward import RewardTerm, fitting, weigh
+
+OBSERVATIONS_HELD = 4
+"""By the environment at a time: the last two, and the two bounds that its batched space has."""
 
 
 class GraspVectorEnv(Environment):
@@ -87,6 +91,12 @@ class GraspVectorEnv(Environment):
         self.single_action_space = Box(-1.0, 1.0, (4,), np.float32)
         self.single_observation_space = observation_space(settings)
         self.privileged = frozenset({PRIVILEGED}) & self.single_observation_space.keys()
+        per_env = OBSERVATIONS_HELD * space_bytes(self.single_observation_space)
+        if lack := shortage(self.num_envs * per_env):
+            raise ValueError(
+                f"num_envs {self.num_envs}: to hold the images of so many cameras {lack}: lower "
+                "it, or let the network see fewer pixels (cameras, sampling)"
+            )
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._parameters: dict[str, ParameterValue] = {}

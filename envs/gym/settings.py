@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, model_validator
+
+MOST_PROCESSES = 1024
 
 
 class GymSettings(BaseModel, frozen=True, extra="forbid"):
@@ -32,3 +34,12 @@ class GymSettings(BaseModel, frozen=True, extra="forbid"):
     kwargs: dict[str, Any] = Field(
         default_factory=dict, description="What else gymnasium.make is given."
     )
+
+    @model_validator(mode="after")
+    def _processes_can_be_had(self) -> GymSettings:
+        if self.vectorization == "async" and self.num_envs > MOST_PROCESSES:
+            raise ValueError(
+                f"num_envs {self.num_envs} and vectorization: async are as many processes: use "
+                f"{MOST_PROCESSES} at most, or vectorization: sync"
+            )
+        return self

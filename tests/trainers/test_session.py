@@ -11,7 +11,9 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
+from curricula.lessons import Lessons
 from curricula.samplers import UniformSampler
+from envs import memory
 from trainers.common.errors import UserError
 from trainers.evaluation import evaluation_environment
 from trainers.experience.episodes import EpisodeBatch
@@ -142,7 +144,7 @@ def test_settings_the_environment_refuses_name_its_section(
         Session(run, registries)
 
 
-@pytest.mark.parametrize("lesson", [0, 1])
+@pytest.mark.parametrize("lesson", [0, 1, 2])
 def test_parameters_the_environment_refuses_are_the_users_mistake(
     make_run: MakeRun,
     registries: Registries,
@@ -150,7 +152,7 @@ def test_parameters_the_environment_refuses_are_the_users_mistake(
     lesson: int,
 ) -> None:
     run = make_run("target", curriculum=LESSONS)
-    environment, refused_scale = run.environment.cls, (3.0, 1.0)[lesson]
+    environment, refused_scale = run.environment.cls, (3.0, 2.0, 1.0)[lesson]
     accept, closed = environment.set_parameters, []
 
     def set_parameters(self: Any, given: Any) -> None:
@@ -164,10 +166,73 @@ def test_parameters_the_environment_refuses_are_the_users_mistake(
     with pytest.raises(UserError, match=message):
         Session(run, registries)
     assert len(closed) == 1
-    if lesson == 1:
+    if lesson == 2:
         with pytest.raises(UserError, match=message):
             evaluation_environment(run, 1)
         assert len(closed) == 2
+
+
+def test_of_a_curriculum_that_does_not_tell_all_its_lessons_the_last_is_looked_at(
+    make_run: MakeRun, registries: Registries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(Lessons, "all_parameters")
+    run, given = make_run("target", curriculum=LESSONS), []
+    monkeypatch.setattr(run.environment.cls, "set_parameters", lambda _, these: given.append(these))
+    Session(run, registries).close()
+    assert given == [{"scale": 1.0}, {"scale": 3.0}]
+
+
+def test_episodes_that_cannot_begin_are_the_users_mistake(
+    make_run: MakeRun, registries: Registries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(self: Any, **_: Any) -> None:
+        raise ValueError("no scene with 3 blocks fits: lower blocks")
+
+    session = Session(make_run("target"), registries)
+    monkeypatch.setattr(type(session.env_runner.env), "reset", full)
+    with pytest.raises(UserError, match=r"^environment: no scene with 3 blocks fits: lower blocks"):
+        session.reset()
+
+
+@pytest.mark.parametrize(
+    ("trainer", "message"),
+    [
+        # 2 x 2000 + 2000, 2000^2 + 2000, 2001 for each of two means and a value, 2; 16 bytes.
+        (
+            {"network_settings": {"hidden_units": 2000, "num_layers": 2, "critic": "shared"}},
+            "trainer.network_settings and encoders: to train networks with 4,014,005 parameters "
+            "needs 0.06 GB, and the machine has 0.05 GB: make hidden layers or encoders smaller",
+        ),
+        # 250,000 steps of 4 environments with 8 bytes each, and 4 KiB of a step's.
+        (
+            {"hyperparameters": {"buffer_size": 10**6}},
+            "trainer.hyperparameters.buffer_size: to collect 1,000,000 transitions before an "
+            "update needs 1.0 GB, and the machine has 0.05 GB: lower it",
+        ),
+        (
+            {"trainer_type": "ddpg", "time_horizon": 10**5},
+            "trainer.time_horizon: to collect 400,000 transitions before an update needs 0.4 GB, "
+            "and the machine has 0.05 GB: lower it",
+        ),
+        # 8 bytes observed, 8 done, 38 beside.
+        (
+            {"trainer_type": "ddpg", "hyperparameters": {"buffer_size": 10**7}},
+            "trainer.hyperparameters.buffer_size: to keep 10,000,000 transitions needs 0.5 GB, "
+            "and the machine has 0.05 GB: lower it",
+        ),
+    ],
+    ids=["networks", "rollout", "time horizon", "replay buffer"],
+)
+def test_what_the_machine_has_no_memory_for_is_refused_before_it_is_made(
+    make_run: MakeRun,
+    registries: Registries,
+    monkeypatch: pytest.MonkeyPatch,
+    trainer: dict[str, Any],
+    message: str,
+) -> None:
+    monkeypatch.setattr(memory, "machine_bytes", lambda: 50 * 10**6)
+    assert refused(make_run, registries, "target", trainer) == message
+    Session(make_run("target"), registries).close()
 
 
 def parameters(session: Session) -> dict[str, Any]:

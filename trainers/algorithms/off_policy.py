@@ -19,6 +19,7 @@ from trainers.algorithms.schedules import CONSTANT, Schedule
 from trainers.common.averager import Averager
 from trainers.experience.collector import BehaviorOutput, CollectedStep, Collector
 from trainers.experience.env_runner import EnvRunner
+from trainers.experience.memory import check_room
 from trainers.experience.replay_buffer import ReplayBuffer
 from trainers.networks.frame_features import FrameFeatures
 from trainers.networks.observations import Observations
@@ -40,10 +41,14 @@ class OffPolicyHyperparameters(BaseModel, frozen=True, extra="forbid"):
     updates_per_step: float = Field(
         1.0,
         gt=0.0,
+        le=1000.0,
         description="Updates per transition; with many environments a fraction of 1 is enough.",
     )
     policy_delay: int = Field(
-        1, ge=1, description="Updates of the critic for each one of the actor and of the targets."
+        1,
+        ge=1,
+        le=1000,
+        description="Updates of the critic for each one of the actor and of the targets.",
     )
     learning_rate: float = Field(1e-3, gt=0.0, description="Of the actor, to begin with.")
     critic_learning_rate: float | None = Field(
@@ -54,12 +59,17 @@ class OffPolicyHyperparameters(BaseModel, frozen=True, extra="forbid"):
     tau: float = Field(
         0.005, gt=0.0, le=1.0, description="How far the target networks follow in an update."
     )
-    n_step: int = Field(1, ge=1, description="Rewards in a return before the critic takes over.")
+    n_step: int = Field(
+        1, ge=1, le=1000, description="Rewards in a return before the critic takes over."
+    )
     random_actions: float = Field(
         0.0, ge=0.0, le=1.0, description="Share of the actions that are drawn uniformly instead."
     )
     random_shift_px: int = Field(
-        0, ge=0, description="Images are shifted by up to so many pixels at random; 0: never."
+        0,
+        ge=0,
+        le=4096,
+        description="Images are shifted by up to so many pixels at random; 0: never.",
     )
     max_gradient_norm: float | None = Field(
         None, gt=0.0, description="Gradients are clipped to this norm; null: not at all."
@@ -149,6 +159,7 @@ class OffPolicyAlgorithm(ABC):
         self._actions_shape = (env.num_envs, size)
         self.collection_steps = settings.time_horizon * env.num_envs
         self._max_gradient_norm = hyper.max_gradient_norm or float("inf")
+        check_room(env, settings.time_horizon, "trainer.time_horizon")
         self._buffer = ReplayBuffer(
             env.single_observation_space, size, env.num_envs, hyper.buffer_size, device
         )

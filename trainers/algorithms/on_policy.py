@@ -14,6 +14,7 @@ from trainers.algorithms.optimization import load_optimizer, optimizer_step
 from trainers.algorithms.schedules import LINEAR, Schedule
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner
+from trainers.experience.memory import check_room
 from trainers.experience.reward_normalizer import RewardNormalizer
 from trainers.experience.rollout import Rollout
 from trainers.experience.rollout_collector import RolloutCollector
@@ -25,7 +26,7 @@ class OnPolicyHyperparameters(BaseModel, frozen=True, extra="forbid"):
 
     batch_size: int = Field(512, ge=1, description="Transitions in one step of gradient descent.")
     buffer_size: int = Field(8192, ge=1, description="Transitions collected before an update.")
-    num_epoch: int = Field(3, ge=1, description="Passes over the buffer in an update.")
+    num_epoch: int = Field(3, ge=1, le=1000, description="Passes over the buffer in an update.")
     learning_rate_schedule: Schedule = Field(LINEAR, description="Course of the learning rates.")
     gamma: float = Field(0.99, ge=0.0, le=1.0, description="Discount factor.")
     lambd: float = Field(0.95, ge=0.0, le=1.0, description="Lambda of the advantage estimate.")
@@ -100,6 +101,7 @@ class OnPolicyAlgorithm:
         count = env_runner.env.num_envs
         steps = -(-hyperparameters.buffer_size // count)
         self.collection_steps = steps * count
+        check_room(env_runner.env, steps, "trainer.hyperparameters.buffer_size")
         self._collector = RolloutCollector(
             policy,
             env_runner,

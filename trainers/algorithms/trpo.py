@@ -42,7 +42,7 @@ class TRPOHyperparameters(OnPolicyHyperparameters, frozen=True, extra="forbid"):
     """Hyper-parameters of TRPO; those of gradient descent are the critic's."""
 
     batch_size: int = Field(128, ge=1, description="Transitions in one step of the critic.")
-    num_epoch: int = Field(10, ge=1, description="The critic's passes over the buffer.")
+    num_epoch: int = Field(10, ge=1, le=1000, description="The critic's passes over the buffer.")
     learning_rate: float = Field(
         1e-3, gt=0.0, description="Of the critic, to begin with; the policy's step is delta's."
     )
@@ -52,11 +52,15 @@ class TRPOHyperparameters(OnPolicyHyperparameters, frozen=True, extra="forbid"):
     fisher_fraction: float = Field(
         1.0, gt=0.0, le=1.0, description="Share of the buffer that the Fisher matrix is taken over."
     )
-    cg_iterations: int = Field(15, ge=1, description="Most iterations of conjugate gradients.")
+    cg_iterations: int = Field(
+        15, ge=1, le=1000, description="Most iterations of conjugate gradients."
+    )
     cg_tolerance: float = Field(
         1e-5, ge=0.0, description="Residual that ends them sooner, relative to the gradient's norm."
     )
-    backtrack_iterations: int = Field(10, ge=1, description="Most trials of the line search.")
+    backtrack_iterations: int = Field(
+        10, ge=1, le=1000, description="Most trials of the line search."
+    )
     backtrack_coefficient: float = Field(
         0.8, gt=0.0, lt=1.0, description="Each trial's share of the step tried before it."
     )

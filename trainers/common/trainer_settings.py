@@ -16,7 +16,7 @@ class TrainerSettings(BaseModel, frozen=True, extra="forbid"):
     )
 
     max_steps: int = Field(
-        500_000, ge=1, description="Steps of the whole run, over all environments."
+        500_000, ge=1, le=10**12, description="Steps of the whole run, over all environments."
     )
     summary_freq: int = Field(10_000, ge=1, description="Steps between two summaries.")
     checkpoint_interval: int = Field(100_000, ge=1, description="Steps between two checkpoints.")

@@ -18,11 +18,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from envs.memory import shortage, space_bytes
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import Step
 from trainers.networks.observations import Observations, frames_differ, is_frame
 
 NONE = -1
+BYTES_BESIDE = 38
+"""Of a transition, next to its observations and its action."""
 _FRAME = ""  # no observation has this name
 _Kind = tuple[tuple[int, ...], np.dtype[Any]]
 """Shape and type of one entry."""
@@ -58,6 +61,11 @@ class ReplayBuffer:
         size = self._rows * num_envs
         frames = {k: _kind(part) for k, part in space.spaces.items() if is_frame(part)}
         vectors = {k: _kind(part) for k, part in space.spaces.items() if not is_frame(part)}
+        if lack := shortage(size * (space_bytes(space) + BYTES_BESIDE + 4 * action_size)):
+            raise UserError(
+                f"trainer.hyperparameters.buffer_size: to keep {capacity:,} transitions {lack}: "
+                "lower it"
+            )
         try:
             # Memory of zeros is given page by page when it is first written to, so that what
             # frames in common and unfinished episodes leave unused costs nothing.

@@ -25,8 +25,8 @@ ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
 class NetworkSettings(BaseModel, frozen=True, extra="forbid"):
     """The part of a network after its encoders."""
 
-    hidden_units: int = Field(256, ge=1, description="Units of each hidden layer.")
-    num_layers: int = Field(2, ge=0, description="Hidden layers after the encoders.")
+    hidden_units: int = Field(256, ge=1, le=4096, description="Units of each hidden layer.")
+    num_layers: int = Field(2, ge=0, le=100, description="Hidden layers after the encoders.")
     activation: Literal["relu", "tanh", "silu", "elu"] = Field(
         "relu", description="Activation of the hidden layers."
     )

@@ -17,7 +17,7 @@ class MemorySettings(BaseModel, frozen=True, extra="forbid"):
     """A recurrent layer after the hidden layers."""
 
     type: Literal["lstm", "gru"] = Field("lstm", description="Kind of the recurrent layer.")
-    memory_size: int = Field(128, ge=1, description="Units of the recurrent layer.")
+    memory_size: int = Field(128, ge=1, le=4096, description="Units of the recurrent layer.")
     sequence_length: int = Field(
         64,
         ge=1,

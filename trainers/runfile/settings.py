@@ -113,7 +113,7 @@ class EvaluationSettings(BaseModel, frozen=True, extra="forbid"):
     changeable_keys: ClassVar[frozenset[str]] = frozenset({"interval", "stop_when"})
 
     interval: int = Field(ge=1, description="Steps of training between two evaluations.")
-    episodes: int = Field(100, ge=1, description="Episodes of each evaluation.")
+    episodes: int = Field(100, ge=1, le=10**6, description="Episodes of each evaluation.")
     seed: int = Field(
         1,
         ge=0,

@@ -23,7 +23,10 @@ Floats = NDArray[np.float64]
 
 
 class SceneError(EnvironmentFailure, ValueError):
-    """The ranges of the run file leave no room for a scene."""
+    """The ranges of the run file leave no room for a scene.
+
+    A mistake in the settings where it shows at the first reset; later on the run ends by it.
+    """
 
 
 @dataclass(frozen=True)

@@ -115,6 +115,14 @@ def play(env: GraspVectorEnv, steps: int, seed: int) -> list[Any]:
 # -- gymnasium's interface -------------------------------------------------------------------------
 
 
+def test_more_pixels_than_the_machine_holds_are_refused_at_once() -> None:
+    camera = Camera(type="depth", width=4096, height=4096)
+    # Twice the observations and twice their bounds, of two bytes a pixel.
+    message = r"^num_envs 65536: .* needs 8,796\.1 GB, and the machine has .* GB: lower it"
+    with pytest.raises(ValueError, match=message):
+        GraspVectorEnv(GraspSettings(num_envs=65536, cameras={"depth": camera}), [])
+
+
 @MODES
 def test_spaces_contain_what_is_delivered(make: MakeEnv, frame_grab: bool) -> None:
     env = make(5, frame_grab=frame_grab, cameras=BOTH, privileged=True, episode_steps=2)

@@ -612,3 +612,9 @@ def test_processes_leave_ctrl_c_to_the_learner() -> None:
             os.kill(process.pid, signal.SIGINT)
         for actions in actions_for(env, 3):
             env.step(actions)
+
+
+def test_there_are_only_so_many_processes() -> None:
+    GymSettings(id="CartPole-v1", num_envs=1025)
+    with pytest.raises(ValueError, match=r"num_envs 1025 .* 1024 at most, or vectorization: sync"):
+        GymSettings(id="CartPole-v1", num_envs=1025, vectorization="async")

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from envs.environment import EnvironmentFailure
 from envs.grasp.scene.placement import BLOCK_CLEARANCE_M, _apart_on_support, rules
 from envs.grasp.scene.sampler import SceneError, Scenes, SceneSampler, heading, to_world
 from envs.grasp.sensors.camera import CameraPoses
@@ -309,6 +310,10 @@ def test_number_of_blocks_is_a_setting(count: int) -> None:
 def test_impossible_ranges_are_an_error_that_names_the_way_out(settings: GraspSettings) -> None:
     with pytest.raises(SceneError, match=r"block_x_m.*target_lead_m.*fov_deg"):
         sample(settings, 1)
+
+
+def test_a_run_that_it_ends_is_told_as_other_failures_of_environments_are() -> None:
+    assert issubclass(SceneError, EnvironmentFailure)
 
 
 @pytest.mark.parametrize(

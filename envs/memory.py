@@ -1,0 +1,50 @@
+"""Memory: what arrays of many environments take, and what the machine has."""
+
+from __future__ import annotations
+
+import math
+import os
+import resource
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+CONTAINER_LIMITS = (
+    Path("/sys/fs/cgroup/memory.max"),
+    Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
+)
+"""Where a container's control group says how much memory it may have: of version 2 and of 1."""
+
+
+def machine_bytes() -> int:
+    """Bytes that this process may have: the machine's, its container's or its own limit's."""
+    known = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    own, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if own != resource.RLIM_INFINITY:
+        known.append(own)
+    for path in CONTAINER_LIMITS:
+        text = path.read_text().strip() if path.is_file() else ""
+        if text.isdigit():  # "max" where there is none
+            known.append(int(text))
+    return min(known)
+
+
+def shortage(needed_bytes: float) -> str | None:
+    """In words, that the machine has not got so much memory; None where it has."""
+    has = machine_bytes()
+    if needed_bytes <= has:
+        return None
+    return f"needs {_gb(needed_bytes)}, and the machine has {_gb(has)}"
+
+
+def _gb(count: float) -> str:
+    return f"{count / 1e9:,.{1 if count >= 1e8 else 2}f} GB"
+
+
+def space_bytes(space: gymnasium.Space[Any]) -> int:
+    """Bytes of one element of a space, or of all that are in a space of spaces."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        return sum(map(space_bytes, space.spaces.values()))
+    return math.prod(space.shape or ()) * np.dtype(space.dtype).itemsize

@@ -1,0 +1,54 @@
+"""Memory: what arrays take, and what the machine has."""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Discrete
+
+from encoders.spaces import DepthImage
+from envs import memory
+from envs.memory import machine_bytes, shortage, space_bytes
+
+
+@pytest.fixture(autouse=True)
+def container(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A container that says nothing of memory yet, on a machine of 32 GiB without other limits."""
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr(memory, "CONTAINER_LIMITS", (limit, tmp_path / "none"))
+    monkeypatch.setattr("os.sysconf", {"SC_PHYS_PAGES": 2**23, "SC_PAGE_SIZE": 2**12}.get)
+    unlimited = (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: unlimited)
+    return limit
+
+
+@pytest.mark.parametrize(
+    ("said", "bytes_"), [(None, 2**35), ("max\n", 2**35), ("4096\n", 4096), (str(2**60), 2**35)]
+)
+def test_a_containers_limit_counts(container: Path, said: str | None, bytes_: int) -> None:
+    if said is not None:
+        container.write_text(said)
+    assert machine_bytes() == bytes_
+
+
+def test_the_process_own_limit_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (10**9, resource.RLIM_INFINITY))
+    assert machine_bytes() == 10**9
+
+
+def test_a_shortage_has_both_numbers() -> None:
+    assert shortage(2**35) is None
+    assert shortage(2**35 + 1) == "needs 34.4 GB, and the machine has 34.4 GB"
+    assert shortage(8e12) == "needs 8,000.0 GB, and the machine has 34.4 GB"
+
+
+def test_bytes_of_a_space() -> None:
+    pictures = {"depth": DepthImage(4, 3), "color": Box(0, 255, (4, 3, 3), np.uint8)}
+    space = gymnasium.spaces.Dict(
+        {**pictures, "state": Box(-1, 1, (5,), np.float32), "one": Discrete(7)}
+    )
+    assert space_bytes(space) == 4 * 3 * 2 + 4 * 3 * 3 + 5 * 4 + 8
