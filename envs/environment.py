@@ -45,6 +45,7 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
     Built as `cls(settings, rewards, seed)`.
 
     Attributes:
+        name: which environment it is, for messages, where its type does not say that.
         Settings: the model of the run file's `environment` section.
         snapshot: the type of what its rewards are computed from; its constructor gives the rewards
             to `rewards.reward.fitting`, which refuses those for another one.
@@ -56,6 +57,7 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
         evaluation_options: what `trainers.evaluate` offers for it, next to its own options.
     """
 
+    name: str = ""
     Settings: ClassVar[type[BaseModel]]
     snapshot: ClassVar[type] = object
     pays_by_itself: ClassVar[bool] = True

@@ -9,11 +9,15 @@ it again.
 from __future__ import annotations
 
 import copy
+import traceback
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
+
+from envs.environment import EnvironmentFailure
+from envs.gym.returned import WrongReturn, checked_reset, checked_step
 
 IS_SUCCESS = "is_success"
 """Key of an info that says whether the episode is a success, as Stable-Baselines3 reads it."""
@@ -27,7 +31,7 @@ def episode_seed(run_seed: int, index: int, episode: int) -> int:
 
 
 class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """One of a run's environments; seeds each of its episodes.
+    """One of a run's environments; seeds each of its episodes, and checks what it returns.
 
     An environment may use an array again that it has handed out, or share it with the others in its
     process. So observations are copied before anything else happens, and so is the info that an
@@ -35,6 +39,7 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     Args:
         env: the environment.
+        name: for messages.
         run_seed: of the run.
         index: which of the run's environments it is, from 0.
         with_infos: pass on the infos of steps. Otherwise they are empty, but for an episode's
@@ -42,11 +47,18 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
     """
 
     def __init__(
-        self, env: gymnasium.Env[Any, Any], run_seed: int, index: int, *, with_infos: bool = False
+        self,
+        env: gymnasium.Env[Any, Any],
+        name: str,
+        run_seed: int,
+        index: int,
+        *,
+        with_infos: bool = False,
     ):
         super().__init__(env)
+        self._name, self._space = name, env.observation_space
         self._run_seed, self._index, self._with_infos = run_seed, index, with_infos
-        self._begun = 0
+        self._begun = self._steps = 0  # episodes, and steps of the last of them
         self._last_info: dict[str, Any] = {}
 
     def count_from(self, run_seed: int, begun: NDArray[np.int64]) -> None:
@@ -65,16 +77,29 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
 
         The info is that of the step which ended the episode before, for gymnasium resets within a
         step, and gathers then what a reset says.
+
+        Raises:
+            EnvironmentFailure: the environment failed, or returned what it may not.
         """
         own = episode_seed(self._run_seed, self._index, self._begun)
         self._begun += 1
-        observation, _ = self.env.reset(seed=own, options=options)
+        self._steps = 0
+        try:
+            returned = self.env.reset(seed=own, options=options)
+            observation, _ = checked_reset(self._space, returned)
+        except (Exception, SystemExit) as error:
+            raise self._failure(error) from error
         info, self._last_info = self._last_info, {}
         return _copied(observation), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Steps the environment."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        """Steps the environment; errors as `reset`'s."""
+        self._steps += 1
+        try:
+            returned = self.env.step(action)
+            observation, reward, terminated, truncated, info = checked_step(self._space, returned)
+        except (Exception, SystemExit) as error:
+            raise self._failure(error) from error
         ended = terminated or truncated
         if not self._with_infos:
             info = {IS_SUCCESS: info[IS_SUCCESS]} if ended and IS_SUCCESS in info else {}
@@ -91,8 +116,21 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         observation, _ = self.reset()
         for action in actions[len(actions) - lengths[self._index] :, self._index].copy():
-            observation, *_ = self.env.step(action)
-        return _copied(observation)
+            observation, *_ = self.step(action)
+        return observation
+
+    def _failure(self, error: BaseException) -> EnvironmentFailure:
+        """Says which environment failed, when, why and where."""
+        call = f"step {self._steps}" if self._steps else "the reset"
+        reason = str(error)
+        if not isinstance(error, WrongReturn):
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            said = f"{type(error).__name__}: {error}".removesuffix(": ")
+            reason = f"{said} ({place.filename}:{place.lineno})"
+        return EnvironmentFailure(
+            f"environment {self._index} of {self._name!r} failed in {call} of its episode "
+            f"{self._begun}: {reason}"
+        )
 
 
 def _copied(observation: Any) -> Any:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import difflib
-import multiprocessing
-import signal
 from functools import partial
 from typing import Any
 
 import gymnasium
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from envs.environment import EnvironmentFailure
 from envs.gym.episodes import RepeatableEpisodes
+from envs.gym.processes import ProcessVectorEnv
 from envs.gym.settings import GymSettings
 from envs.gym.spaces import WRAP, flattens
 
-GymVectorEnv = SyncVectorEnv[Any, Any] | AsyncVectorEnv[Any, Any]
+GymVectorEnv = SyncVectorEnv[Any, Any] | ProcessVectorEnv
 EXTRAS = {"gymnasium.envs.mujoco": "mujoco", "gymnasium.envs.box2d": "box2d"}
 """Packages of environments -> our optional dependencies that they need."""
 
@@ -31,15 +31,17 @@ def make_vector_env(settings: GymSettings, seed: int, *, with_infos: bool) -> Gy
     Raises:
         ValueError: it does not exist, lacks a package, refuses its arguments, or can't be stepped
             beside others.
+        EnvironmentFailure: one of their processes died or hangs.
     """
     makers = [
         partial(_make_one, settings, seed, index, with_infos) for index in range(settings.num_envs)
     ]
-    vectorize = SyncVectorEnv if settings.vectorization == "sync" else AsyncVectorEnv
-    # Whoever reads the observations copies them anyway.
     try:
-        return vectorize(makers, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
-    except ValueError:
+        if settings.vectorization == "async":
+            return ProcessVectorEnv(makers, settings.id, settings.timeout_s)
+        # Whoever reads the observations copies them anyway.
+        return SyncVectorEnv(makers, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
+    except (ValueError, EnvironmentFailure):
         raise
     except Exception as error:
         raise ValueError(
@@ -61,7 +63,7 @@ def make(settings: GymSettings) -> gymnasium.Env[Any, Any]:
         ) from error
     except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
         raise ValueError(f"id: {name!r} lacks a package: {error}{_remedy(name)}") from error
-    except Exception as error:  # an environment is foreign code: it can refuse in any way
+    except (Exception, SystemExit) as error:  # foreign code: it can refuse in any way
         given = f" with kwargs {settings.kwargs}" if settings.kwargs else ""
         raise ValueError(
             f"{name!r} can't be made{given}: {type(error).__name__}: {error}"
@@ -81,11 +83,8 @@ def _flattened(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
 def _make_one(
     settings: GymSettings, seed: int, index: int, with_infos: bool
 ) -> gymnasium.Env[Any, Any]:
-    if multiprocessing.parent_process() is not None:
-        # A process of its own: Ctrl-C is for the learner, which ends its environments.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    return RepeatableEpisodes(make(settings), seed, index, with_infos=with_infos)
+    env = make(settings)
+    return RepeatableEpisodes(env, settings.id, seed, index, with_infos=with_infos)
 
 
 def _nearest(name: str) -> str:

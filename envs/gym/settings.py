@@ -20,6 +20,13 @@ class GymSettings(BaseModel, frozen=True, extra="forbid"):
     vectorization: Literal["sync", "async"] = Field(
         "sync", description="All in this process one after the other, or each in a process."
     )
+    timeout_s: float = Field(
+        60.0,
+        gt=0.0,
+        le=86_400.0,
+        description="Seconds that a step or a reset of an environment in a process of its own may "
+        "take; one that does not answer ends the run with an error.",
+    )
     max_episode_steps: int | None = Field(
         None, ge=1, description="Steps before an episode is truncated; null: the environment's own."
     )

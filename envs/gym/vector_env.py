@@ -24,6 +24,9 @@ from rewards.reward import RewardTerm, fitting, weigh
 ADDED_INFOS = ("final_obs", "_final_obs", "final_info", "_final_info")
 """Keys that gymnasium itself adds to the infos of a step in which an episode ends."""
 
+LONGEST_REPLAY_STEPS = 30_000
+"""Of an episode that is played again where a run goes on: a game of Atari's still is."""
+
 _logger = logging.getLogger("ventosa")
 
 
@@ -33,7 +36,8 @@ class GymEnvironment(Environment):
     A state to go on from is the number of each environment's episode, which gives its seed, and its
     actions so far: what happened is played again. That is exact where an environment draws
     everything from gymnasium's `np_random` and keeps nothing from one episode to the next; where it
-    is not, a warning is logged.
+    is not, a warning is logged. The actions of an episode of over `LONGEST_REPLAY_STEPS` are given
+    up, as it may never end: the next one begins in its place, after a warning, too.
 
     Args:
         settings: which environment.
@@ -49,7 +53,7 @@ class GymEnvironment(Environment):
 
     def __init__(self, settings: GymSettings, rewards: Sequence[RewardTerm[Any]], seed: int = 0):
         self._rewards = fitting(rewards, self.snapshot)
-        self._id, self._seed = settings.id, seed
+        self.name, self._seed = settings.id, seed
         self.num_envs = settings.num_envs
         self._vector = make_vector_env(settings, seed, with_infos=bool(rewards))
         try:
@@ -66,7 +70,7 @@ class GymEnvironment(Environment):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._begun = np.zeros(self.num_envs, np.int64)
         self._lengths = np.zeros(self.num_envs, np.int64)
-        # As many steps as the longest episode has.
+        # As many steps as the longest episode has that can be played again, at least.
         self._history = ActionHistory(self.action_space.shape or (), self.action_space.dtype)
         self._observations: ObservationArrays = {}
         self._tells_success = False  # no episode that did has ended yet
@@ -112,6 +116,8 @@ class GymEnvironment(Environment):
         )
         self._history.append(actions)
         self._lengths += 1
+        if len(self._history.actions) > LONGEST_REPLAY_STEPS:
+            self._history.keep(self._longest_replay())
         self._observations = self._observe(observations)
         infos = self._end_episodes(terminated | truncated, gathered)
         if self._rewards:
@@ -130,6 +136,7 @@ class GymEnvironment(Environment):
 
     def state_dict(self) -> dict[str, Any]:
         """See `Environment.state_dict`."""
+        self._history.keep(self._longest_replay())
         return {
             "seed": self._seed,
             "begun": self._begun.copy(),
@@ -150,14 +157,16 @@ class GymEnvironment(Environment):
         self._begun, self._lengths = state["begun"].copy(), state["lengths"].copy()
         self._history.load(state["actions"])
         self._tells_success = state.get("tells_success", False)
+        endless = self._lengths > len(state["actions"])
+        self._pass_over(endless)
         self._call("count_from", self._seed, self._begun - 1)
         played = self._call("play", self._lengths, state["actions"])
         self._observations = self._observe(self._stacked(played))
-        if not _equal(self._observations, state["observations"]):
+        if not _equal(self._observations, state["observations"], ~endless):
             _logger.warning(
                 "the environment %r did not come back to where it was: played again, its episodes "
                 "go another way, so this run goes on well, but not exactly",
-                self._id,
+                self.name,
             )
         return self._observations
 
@@ -172,14 +181,13 @@ class GymEnvironment(Environment):
             )
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Ends the environments, and their processes even where one has died."""
+        """Ends the environments."""
         try:
             self._vector.close()
-        except (OSError, EOFError):
-            for process in getattr(self._vector, "processes", ()):
-                process.terminate()
-                process.join()
-            self._vector.closed = True
+        except Exception as error:  # foreign code, of which nothing is needed any more
+            _logger.warning(
+                "the environment %r did not close: %s: %s", self.name, type(error).__name__, error
+            )
 
     def _end_episodes(self, done: NDArray[np.bool_], gathered: Mapping[str, Any]) -> dict[str, Any]:
         """Counts the episodes that ended, (N,); infos that tell of them, empty where none did."""
@@ -187,9 +195,28 @@ class GymEnvironment(Environment):
             return {}
         self._begun[done] += 1
         self._lengths[done] = 0
-        self._history.keep(int(self._lengths.max()))
+        self._history.keep(self._longest_replay())
         final = self._final(gathered["final_obs"], done)
         return {"final_obs": final, "_final_obs": done, **self._success(gathered, done)}
+
+    def _longest_replay(self) -> int:
+        """Steps of the longest running episode that can be played again."""
+        return int(self._lengths.max(initial=0, where=self._lengths <= LONGEST_REPLAY_STEPS))
+
+    def _pass_over(self, endless: NDArray[np.bool_]) -> None:
+        """Takes the next episodes in the place of some (N,) that can't be played again."""
+        if not endless.any():
+            return
+        self._begun[endless] += 1
+        self._lengths[endless] = 0
+        _logger.warning(
+            "the episodes of %d of %d environments %r were longer than %d steps, so that their "
+            "actions were not kept: they begin new ones, so this run goes on well, but not exactly",
+            endless.sum(),
+            self.num_envs,
+            self.name,
+            LONGEST_REPLAY_STEPS,
+        )
 
     def _success(self, gathered: Mapping[str, Any], done: NDArray[np.bool_]) -> dict[str, Any]:
         """Success of the episodes that ended, (N,), where the environment tells it.
@@ -225,16 +252,14 @@ class GymEnvironment(Environment):
         return self._guarded(self._vector.call, method, *arguments)
 
     def _guarded(self, function: Any, *arguments: Any) -> Any:
-        """Calls into the environments, which may fail in any way."""
+        """Calls the environments; what gymnasium can't put together is a failure, too."""
         try:
             return function(*arguments)
-        except (EOFError, ConnectionError) as error:
-            raise EnvironmentFailure(
-                f"the environment {self._id!r} failed: one of its processes died"
-            ) from error
+        except EnvironmentFailure:
+            raise
         except Exception as error:
             reason = f"{type(error).__name__}: {error}".removesuffix(": ")
-            raise EnvironmentFailure(f"the environment {self._id!r} failed: {reason}") from error
+            raise EnvironmentFailure(f"the environment {self.name!r} failed: {reason}") from error
 
 
 def _before_reset(observations: ObservationArrays, infos: Mapping[str, Any]) -> ObservationArrays:
@@ -248,7 +273,8 @@ def _before_reset(observations: ObservationArrays, infos: Mapping[str, Any]) -> 
     return last
 
 
-def _equal(first: ObservationArrays, second: ObservationArrays) -> bool:
+def _equal(first: ObservationArrays, second: ObservationArrays, where: NDArray[np.bool_]) -> bool:
+    """Whether observations (N, ...) are the same in some environments (N,)."""
     return first.keys() == second.keys() and all(
-        np.array_equal(values, second[name]) for name, values in first.items()
+        np.array_equal(values[where], second[name][where]) for name, values in first.items()
     )

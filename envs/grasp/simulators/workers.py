@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from multiprocessing.connection import Connection, Pipe
 from typing import Any
 
@@ -20,15 +21,19 @@ from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.settings import Support
 from envs.grasp.simulators.base import Contacts, Floats, Images, Indices, SimulatorError
 from envs.grasp.simulators.pybullet import PyBulletSimulator
+from envs.processes import end_with_parent
 
+ANSWER_TIMEOUT_S = 300.0
+"""For what one call asks of one worker's worlds, which takes a second or so."""
 CLOSE_TIMEOUT_S = 5.0
+"""For all workers to end; those that have not are killed."""
 
 
 class ParallelSimulator:
     """N worlds over worker processes. Implements `envs.grasp.simulators.base.Simulator`.
 
     A worker is a plain subprocess running this module, so that it imports the simulator and not the
-    learner; it ends by itself when its pipe closes, however the parent came to its end.
+    learner; it ends with its parent, however that came to its end, and whatever it was doing.
 
     Args:
         num_worlds: N.
@@ -68,8 +73,12 @@ class ParallelSimulator:
 
     def close(self) -> None:
         """See `Simulator.close`."""
-        while self._workers:
-            self._workers.pop().close()
+        workers, self._workers = self._workers, []
+        deadline = time.monotonic() + CLOSE_TIMEOUT_S
+        for worker in workers:
+            worker.dismiss()
+        for worker in workers:
+            worker.end(deadline)
 
     def _call(self, method: str, indices: Indices, *arguments: Any) -> list[Any]:
         """Calls a method with each worker's rows of the arguments; what has no rows goes to all."""
@@ -113,6 +122,11 @@ class _Worker:
             raise self._death() from error
 
     def receive(self) -> Any:
+        if not self._pipe.poll(ANSWER_TIMEOUT_S):
+            raise SimulatorError(
+                f"worker {self._number} (process {self._process.pid}) of the simulator has not "
+                f"answered for {ANSWER_TIMEOUT_S:g} s: it hangs"
+            )
         try:
             succeeded, value = self._pipe.recv()
         except (EOFError, ConnectionResetError) as error:
@@ -121,10 +135,12 @@ class _Worker:
             raise SimulatorError(f"worker {self._number} failed: {value}")
         return value
 
-    def close(self) -> None:
+    def dismiss(self) -> None:
         self._pipe.close()
+
+    def end(self, deadline: float) -> None:
         try:
-            self._process.wait(CLOSE_TIMEOUT_S)
+            self._process.wait(max(deadline - time.monotonic(), 0.0))
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
@@ -142,6 +158,7 @@ class _Worker:
 
 def _serve(pipe: Connection) -> None:
     """A worker's life: build the simulator, then do what is asked until the pipe closes."""
+    end_with_parent()
     simulator: PyBulletSimulator | None = None
     try:
         simulator = PyBulletSimulator(*pipe.recv())

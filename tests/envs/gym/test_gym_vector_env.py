@@ -16,6 +16,7 @@ import pytest
 from gymnasium.spaces import Box, Dict, Discrete, Sequence
 
 from envs.environment import EnvironmentFailure
+from envs.gym import vector_env
 from envs.gym.episodes import episode_seed
 from envs.gym.settings import GymSettings
 from envs.gym.vector_env import GymEnvironment
@@ -230,6 +231,59 @@ def test_an_environment_that_can_not_be_played_again_is_told(
     env.reset()
     env.load_state_dict(env.state_dict())
     assert "'ventosa_tests/Room-v0' did not come back to where it was" in caplog.text
+
+
+class Endless(gymnasium.Env[Any, Any]):
+    """Sees its seed, less what it holds in no float, and its steps; one of two has an end."""
+
+    observation_space = Box(0.0, np.inf, (2,), np.float32)
+    action_space = Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.seen = np.array([int(seed or 0) % 1000, 0], np.float32)
+        self.ends = seed != episode_seed(7, 0, 0)
+        return self.seen, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.seen = self.seen + np.array([0, 1])
+        return self.seen.astype(np.float32), 0.0, False, self.ends and self.seen[1] == 4, {}
+
+
+@pytest.fixture
+def endless(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    monkeypatch.setattr(vector_env, "LONGEST_REPLAY_STEPS", 5)
+    gymnasium.register("ventosa_tests/Endless-v0", entry_point=Endless)
+    yield "ventosa_tests/Endless-v0"
+    del gymnasium.registry["ventosa_tests/Endless-v0"]
+
+
+def test_the_actions_of_an_endless_episode_are_given_up(
+    endless: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    env, other = make(endless, 2), make(endless, 2)
+    env.reset()
+    kept = []
+    for actions in actions_for(env, 50):
+        env.step(actions)
+        kept.append(len(env._history.actions))
+    assert kept[:9] == [1, 2, 3, 4, 5, 2, 3, 0, 1]  # the second one's fourth step ends its episode
+    assert max(kept[9:]) == 3
+    state = env.state_dict()
+    assert state["lengths"].tolist() == [50, 2]
+    assert len(state["actions"]) == 2
+    loaded = other.load_state_dict(state)["observation"]
+    begun = [episode_seed(7, 0, 1) % 1000, 0.0]  # the next episode of the first environment
+    assert loaded.tolist() == [begun, state["observations"]["observation"][1].tolist()]
+    assert "episodes of 1 of 2 environments" in caplog.text
+    assert "longer than 5 steps" in caplog.text
+    assert "did not come back" not in caplog.text
+    assert other.state_dict()["lengths"].tolist() == [0, 2]
+    assert other.state_dict()["begun"].tolist() == [2, 13]
+    # From there on it goes on exactly.
+    third = make(endless, 2)
+    third.load_state_dict(other.state_dict())
+    for actions in actions_for(env, 4):
+        assert_same(third.step(actions), other.step(actions))
 
 
 # -- settings -------------------------------------------------------------------------------------
@@ -582,13 +636,16 @@ def test_an_action_that_a_reward_writes_to_is_played_again_as_it_was(reusing: st
 # -- failures -------------------------------------------------------------------------------------
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning:gymnasium.vector")
 @pytest.mark.parametrize(
     ("vectorization", "trouble", "message"),
     [
-        ("sync", "error", "Room-v0' failed: RuntimeError: the room collapsed"),
-        ("async", "error", "Room-v0' failed: RuntimeError: the room collapsed"),
-        ("async", "death", "Room-v0' failed: one of its processes died"),
+        (
+            "sync",
+            "error",
+            "Room-v0' failed in step 2 of its episode 1: RuntimeError: the room coll",
+        ),
+        ("async", "error", "Room-v0' failed in step 2 of its episode 1: RuntimeError: the room co"),
+        ("async", "death", r"Room-v0': its process \d+ was killed by SIGKILL .* asked to step"),
     ],
 )
 def test_an_environment_that_breaks_down_is_named_and_can_be_closed(

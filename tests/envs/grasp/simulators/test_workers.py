@@ -143,6 +143,22 @@ def test_a_worker_that_dies_at_work_is_noticed(
         two_workers._workers[0].receive()
 
 
+def test_a_worker_that_hangs_is_named_and_killed(
+    scenes_and_views: tuple[Scenes, dict[str, CameraPoses]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulator = ParallelSimulator(COUNT, 2, ROBOT, Support())
+    simulator.load(np.arange(COUNT), scenes_and_views[0], home(COUNT))
+    victim = pids(simulator)[1]
+    os.kill(victim, signal.SIGSTOP)
+    monkeypatch.setattr("envs.grasp.simulators.workers.ANSWER_TIMEOUT_S", 0.1)
+    told = rf"worker 1 \(process {victim}\) .* has not answered for 0.1 s: it hangs"
+    with pytest.raises(SimulatorError, match=told):
+        simulator._workers[1].receive()
+    monkeypatch.setattr("envs.grasp.simulators.workers.CLOSE_TIMEOUT_S", 0.1)
+    simulator.close()
+    assert not runs(victim)
+
+
 def test_a_workers_exception_is_passed_on_and_leaves_no_answer_behind(
     two_workers: ParallelSimulator,
     in_process: PyBulletSimulator,
@@ -182,6 +198,9 @@ def test_workers_end_when_the_parent_is_killed() -> None:
         "from envs.grasp.settings import Support\n"
         "from envs.grasp.simulators.workers import ParallelSimulator\n"
         "simulator = ParallelSimulator(4, 2, load_robot(), Support())\n"
+        "for worker in simulator._workers:\n"
+        "    worker.send(('__repr__',))\n"
+        "    worker.receive()\n"
         "print(*[worker._process.pid for worker in simulator._workers], flush=True)\n"
         "input()\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
@@ -196,6 +215,7 @@ def test_workers_end_when_the_parent_is_killed() -> None:
     workers = [int(pid) for pid in parent.stdout.readline().split()]
     assert len(workers) == 2
     assert all(runs(pid) for pid in workers)
+    os.kill(workers[0], signal.SIGSTOP)  # one that hangs does, too
     parent.communicate("\n")
     assert parent.returncode == -signal.SIGKILL
     deadline = time.monotonic() + 30.0
