@@ -17,6 +17,7 @@ from torch import Tensor
 from envs.environment import Environment, EnvironmentFailure
 from envs.evaluation import EvaluationReport, Evaluator, Figure, PhysicalCheck
 from trainers.common.errors import UserError
+from trainers.common.stopping import may_be_given_up
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import EpisodeBatch, concatenate
 from trainers.inference.metadata import read_metadata
@@ -380,7 +381,8 @@ def first_actions(
         outcomes.append(check(asked_for) if check is not None else {})
         if pictures is not None:
             pictures.add(asked_for, outcomes[-1])
-        *_, infos = env.step(actions)
+        with may_be_given_up():
+            *_, infos = env.step(actions)
         metrics.append(infos.get("episode_metrics", {}))
     return _joined(metrics, episodes), _joined(outcomes, episodes)
 

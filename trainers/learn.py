@@ -10,8 +10,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
-from trainers.common import process
+from trainers.common import process, stopping
 from trainers.common.command import DONE, INTERRUPTED, TERMINATED, tells_failures
 from trainers.common.errors import UserError
 from trainers.common.origin import PACKAGES
@@ -80,25 +81,34 @@ class Stop:
     def __call__(self, number: int, _frame: FrameType | None) -> None:
         """Handles a signal: the first asks to stop, the second insists.
 
+        The first sets an alarm, too, for an environment that does not return; again and again, as
+        an environment may be called without a question whether to stop, or swallow the alarm.
+
         Raises:
             KeyboardInterrupt: it is the second.
         """
         if self.requested():
             raise KeyboardInterrupt
         self.exit_code = INTERRUPTED if number == signal.SIGINT else TERMINATED
+        signal.setitimer(signal.ITIMER_REAL, stopping.PATIENCE_S, 1.0)
 
 
 @contextmanager
 def stop_on_signals() -> Iterator[Stop]:
     """Turns Ctrl-C, SIGTERM and the end of the terminal into a request to stop and save."""
     stop = Stop()
-    numbers = [signal.SIGINT, signal.SIGTERM]
+    handlers: dict[int, Any] = {
+        signal.SIGINT: stop,
+        signal.SIGTERM: stop,
+        signal.SIGALRM: stopping.give_up,
+    }
     if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as it is under nohup
-        numbers.append(signal.SIGHUP)
-    before = {number: signal.signal(number, stop) for number in numbers}
+        handlers[signal.SIGHUP] = stop
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield stop
     finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
             signal.signal(number, handler)
 

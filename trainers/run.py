@@ -16,8 +16,8 @@ from trainers.common.command import told
 from trainers.common.errors import UserError, first_lines
 from trainers.common.files import write_atomically
 from trainers.common.origin import blaming_plugins
+from trainers.common.stopping import StopRequested
 from trainers.common.timers import Timer, recording
-from trainers.experience.env_runner import StopRequested
 from trainers.held_out import HeldOutEvaluation
 from trainers.inference.construction import check_weights, load_weights
 from trainers.inference.metadata import FILE as METADATA
@@ -73,10 +73,10 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
         if resumed is not None:
             _check_unchanged(directory, run, registries)
         session = stack.enter_context(closing(Session(run, registries, stop_requested)))
-        # Nothing is replaced before it is certain that the run can begin.
-        notes = _start(session, options, resumed)
-        start = session.env_runner.step_count
         try:
+            # Nothing is replaced before it is certain that the run can begin.
+            notes = _start(session, options, resumed)
+            start = session.env_runner.step_count
             held_out = stack.enter_context(_held_out(session, run, start, stop_requested))
         except StopRequested:
             return False  # there is nothing to save yet that is not saved

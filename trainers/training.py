@@ -11,8 +11,8 @@ from torch import Tensor
 from trainers.algorithms.base import TrainerSettings
 from trainers.common.averager import Averager
 from trainers.common.errors import NonFiniteError
+from trainers.common.stopping import StopRequested
 from trainers.common.timers import timed
-from trainers.experience.env_runner import StopRequested
 from trainers.held_out import HeldOutEvaluation
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.summary import Summary

@@ -18,8 +18,8 @@ from encoders.cameras import Pinhole
 from encoders.spaces import DepthImage
 from envs.gym.vector_env import GymEnvironment
 from trainers.algorithms.ppo import PPO
+from trainers.common.stopping import StopRequested
 from trainers.evaluation import evaluate
-from trainers.experience.env_runner import StopRequested
 from trainers.inference.policy import Policy
 from trainers.runfile.registry import BUILT_IN_PLUGINS, load_registries, plugin_manager
 from trainers.runfile.settings import load_run

@@ -564,7 +564,8 @@ def test_a_reward_that_breaks_ends_the_run_with_its_name_and_the_way_back(
     done = learn(tiny_grasp(write_run), rewards)
     assert done.code == 1
     way_back = last.format(done.results / "toy/checkpoints")
-    broken = f"error: step {step}: the reward 'breaking' of environment 0 is nan; {way_back}\n"
+    what = "the reward 'breaking' of environment 0 is nan, and should be finite"
+    broken = f"error: step {step}: {what}; {way_back}\n"
     assert done.errors.endswith(broken)
     said = status(done.results)
     assert said["state"] == "failed"
@@ -583,7 +584,7 @@ def test_observations_that_are_not_numbers_end_the_run(
     monkeypatch.setattr(cls, "show", shown)
     done = learn(write_run(), "trainer.checkpoint_interval=16")
     assert done.code == 1
-    assert "the observation 'goal' of environment 0 is nan; the last good" in done.errors
+    assert "the observation 'goal' of environment 0 is nan, and should be" in done.errors
 
 
 def test_a_killed_worker_ends_the_run_by_its_name_and_leaves_it_saved(
@@ -606,7 +607,7 @@ def test_a_killed_worker_ends_the_run_by_its_name_and_leaves_it_saved(
         done = learn(config, "trainer.checkpoint_interval=1000000")
     assert done.code == 1
     killed = f"worker 1 (process {processes[1].pid}) of the simulator was killed by SIGKILL"
-    assert f"error: {killed}" in done.errors
+    assert f"error: step 32: {killed}" in done.errors
     assert status(done.results)["state"] == "failed"
     assert done.step == 16
     assert processes[0].poll() == 0  # the other one ended in peace

@@ -16,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import Tensor, nn
 
 from trainers.common.command import DONE, MISTAKE
-from trainers.experience.env_runner import StopRequested
+from trainers.common.stopping import StopRequested
 from trainers.held_out import HeldOutEvaluation
 from trainers.runfile.settings import Component, RunSettings
 from trainers.saving.checkpoint import Checkpoints

@@ -16,7 +16,7 @@ import torch
 from envs.environment import EnvironmentFailure
 from trainers import training as training_module
 from trainers.common.errors import NonFiniteError
-from trainers.experience.env_runner import StopRequested
+from trainers.common.stopping import StopRequested
 from trainers.reporting.summary import Summary
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings

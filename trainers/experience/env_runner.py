@@ -13,12 +13,9 @@ from numpy.typing import NDArray
 from curricula.samplers import ParameterValue
 from envs.environment import Environment, EnvironmentFailure
 from trainers.common.errors import NonFiniteError
+from trainers.common.stopping import StopRequested, may_be_given_up
 from trainers.common.timers import timed
 from trainers.experience.episodes import Cohorts, EpisodeBatch
-
-
-class StopRequested(Exception):  # noqa: N818 - nothing went wrong
-    """The user asked the run to stop."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +93,13 @@ class EnvRunner:
         """Begins an episode everywhere; a seed says which ones.
 
         Nothing is left of episodes that ran, nor of those that `pop_finished` did not give yet.
+
+        Raises:
+            StopRequested: the run is to stop, and an environment did not return.
+            EnvironmentFailure: one broke down.
         """
-        self.observations, _ = self.env.reset(seed=seed)
+        with self._stoppable():
+            self.observations, _ = self.env.reset(seed=seed)
         self._open_books()
         # All first episodes after a reset are of one cohort.
         self._begun = -(-self._begun // self.env.num_envs) * self.env.num_envs
@@ -108,12 +110,13 @@ class EnvRunner:
         """Takes one action (N, ...) in every environment.
 
         Raises:
-            StopRequested: the run is to stop; nothing was done.
+            StopRequested: the run is to stop: nothing was done, or an environment did not return.
             NonFiniteError: a reward or an observation is NaN or infinite.
-            EnvironmentFailure: an episode was truncated, and its last observation is not there.
+            EnvironmentFailure: one broke down; or an episode was truncated, and its last
+                observation is not there.
         """
         self.check_stop()
-        with timed("environment"):
+        with timed("environment"), self._stoppable(self.env.num_envs):
             observations, reward, terminated, truncated, infos = self.env.step(actions)
         self.step_count += self.env.num_envs
         terms = infos.get("reward_terms", {})
@@ -193,7 +196,8 @@ class EnvRunner:
                 raise ValueError(
                     f"it was saved with {len(values)} environments, not {self.env.num_envs}"
                 )
-        self.observations = self.env.load_state_dict(state["env"])
+        with self._stoppable():
+            self.observations = self.env.load_state_dict(state["env"])
         self.step_count = state["step_count"]
         self._reward, self._length = state["reward"].copy(), state["length"].copy()
         self._terms = {name: values.copy() for name, values in state["terms"].items()}
@@ -204,6 +208,24 @@ class EnvRunner:
         self._cohorts = Cohorts(count)
         if "cohorts" in state:
             self._cohorts.load_state_dict(state["cohorts"])
+
+    @contextmanager
+    def _stoppable(self, steps: int = 0) -> Iterator[None]:
+        """Calls the environments, which need not come back where the run is to stop.
+
+        What stops a run may have reached their processes, too: that they died is no failure then.
+
+        Args:
+            steps: that are taken.
+        """
+        with may_be_given_up():
+            try:
+                yield
+            except EnvironmentFailure as failure:
+                if self._stop_requested():
+                    raise StopRequested from failure
+                step = self.step_count + steps
+                raise EnvironmentFailure(f"step {step}: {failure}") from failure
 
     def _begin(self, where: NDArray[np.bool_]) -> None:
         """Numbers the episodes that begin in some environments (N,)."""
@@ -254,6 +276,8 @@ class EnvRunner:
         if broken.any():
             environment = int(np.argwhere(broken)[0][0])
             value = np.asarray(values)[broken].flat[0]
+            of_id = f" of {self.env.name!r}" if self.env.name else ""
             raise NonFiniteError(
-                f"step {self.step_count}: the {what} of environment {environment} is {value}"
+                f"step {self.step_count}: the {what} of environment {environment}{of_id} is "
+                f"{value}, and should be finite"
             )

@@ -13,7 +13,8 @@ from gymnasium.spaces import Box
 from encoders.spaces import RgbImage
 from envs.environment import EnvironmentFailure
 from trainers.common.errors import NonFiniteError
-from trainers.experience.env_runner import EnvRunner, Step, StopRequested
+from trainers.common.stopping import StopRequested
+from trainers.experience.env_runner import EnvRunner, Step
 
 SPACE = gymnasium.spaces.Dict({"x": Box(-np.inf, np.inf, (1,), np.float32), "eye": RgbImage(2, 2)})
 ACTIONS = np.zeros((2, 1))
@@ -121,7 +122,8 @@ def poisoned(values: Any, at: tuple[int, ...], by: float) -> np.ndarray:
 def test_a_broken_reward_is_named_with_its_step_and_environment(scripted: Any, bad: float) -> None:
     env_runner = begun(script(scripted, reward=poisoned(REWARD, (1, 1), bad)))
     env_runner.step(ACTIONS)
-    with pytest.raises(NonFiniteError, match=rf"^step 4: the reward of environment 1 is {bad}$"):
+    told = rf"^step 4: the reward of environment 1 is {bad}, and should be finite$"
+    with pytest.raises(NonFiniteError, match=told):
         env_runner.step(ACTIONS)
 
 
@@ -130,7 +132,7 @@ def test_a_broken_term_is_named_rather_than_the_sum(scripted: Any) -> None:
     reward = poisoned(REWARD, (0, 0), np.nan)
     env_runner = begun(script(scripted, reward=reward, terms=terms))
     with pytest.raises(
-        NonFiniteError, match=r"^step 2: the reward 'near' of environment 0 is nan$"
+        NonFiniteError, match=r"^step 2: the reward 'near' of environment 0 is nan, and"
     ):
         env_runner.step(ACTIONS)
 
