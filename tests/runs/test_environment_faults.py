@@ -97,8 +97,9 @@ ANYWHERE: dict[str, tuple[Any, str]] = {
     "exit": (lambda good: sys.exit(3), "SystemExit: 3"),
     "nothing": (lambda good: None, "tuple|NoneType"),
     "a list": (list, "a tuple|not a tuple|tuple, actual"),
-    "too few": (lambda good: good[:-1], r"a tuple|four or five|expected \d"),
-    "too many": (lambda good: (*good, None), r"a tuple|four or five|expected \d"),
+    # In a first step gymnasium takes four for what its environments once returned.
+    "too few": (lambda good: good[:-1], r"a tuple|expected \d|dictionary"),
+    "too many": (lambda good: (*good, None), r"a tuple|expected \d|four or five"),
     "no observation": (result(0, None), "dict"),
     "an array": (result(0, np.zeros(2)), "dict"),
     "missing key": (lambda good: ({"x": good[0]["x"]}, *good[1:]), "keys"),
@@ -224,11 +225,13 @@ def assert_saved(results: Path, step: int, state: str, reason: str) -> None:
     if step == RESET:
         assert not results.exists() or not saved
         return
-    collections = (step - 1) * NUM_ENVS // BUFFER_STEPS
-    assert int(saved[-1].name.removeprefix("step-")) == collections * BUFFER_STEPS
     status = json.loads((results / "toy/status.json").read_text())
     assert status["state"] == state
     assert re.search(reason, status["reason"])
+    if "should be finite" in status["reason"]:
+        return  # the learner refuses it, which keeps to the last checkpoint
+    collections = (step - 1) * NUM_ENVS // BUFFER_STEPS
+    assert int(saved[-1].name.removeprefix("step-")) == collections * BUFFER_STEPS
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning:gymnasium.utils")

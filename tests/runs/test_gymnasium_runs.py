@@ -16,7 +16,9 @@ from gymnasium.spaces import Box, Dict, Discrete
 
 from encoders.cameras import Pinhole
 from encoders.spaces import DepthImage
+from envs.environment import EnvironmentFailure
 from envs.gym.vector_env import GymEnvironment
+from trainers import evaluation
 from trainers.algorithms.ppo import PPO
 from trainers.common.stopping import StopRequested
 from trainers.evaluation import evaluate
@@ -130,6 +132,16 @@ def test_mistakes_are_told_before_anything_starts(
     assert told.code == 2
     assert not told.results.exists()
     assert re.search(message, told.errors)
+
+
+def test_an_evaluation_without_an_end_ends_with_what_to_set(
+    learn: Learn, write_run: WriteRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = learn(write_run(PENDULUM)).results
+    monkeypatch.setattr(evaluation, "EPISODE_STEP_LIMIT", 60)
+    endless = ["environment.max_episode_steps=1000000"]
+    with pytest.raises(EnvironmentFailure, match=r"in 60 steps: set a limit, .*max_episode_steps="):
+        evaluate(str(results / "toy"), episodes=2, overrides=endless)
 
 
 class Cameras(gymnasium.Env[Any, Any]):

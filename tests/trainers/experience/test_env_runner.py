@@ -112,6 +112,24 @@ def test_a_stop_is_honoured_before_anything_is_done(scripted: Any) -> None:
     assert env.time == 1
 
 
+def test_a_failure_has_its_step_and_is_none_where_the_run_is_to_stop(
+    scripted: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(actions: Any) -> Any:
+        raise EnvironmentFailure("a process was killed by SIGTERM")
+
+    stopping = iter([False, False, False, False, True])  # asked once more where it failed
+    env = script(scripted)
+    env_runner = EnvRunner(env, lambda: next(stopping))
+    env_runner.reset()
+    env_runner.step(ACTIONS)
+    monkeypatch.setattr(env, "step", fail)
+    with pytest.raises(EnvironmentFailure, match=r"^step 4: a process was killed by SIGTERM$"):
+        env_runner.step(ACTIONS)
+    with pytest.raises(StopRequested):
+        env_runner.step(ACTIONS)
+
+
 def poisoned(values: Any, at: tuple[int, ...], by: float) -> np.ndarray:
     array = np.array(values, np.float64)
     array[at] = by
