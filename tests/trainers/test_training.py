@@ -579,8 +579,8 @@ def test_what_failed_first_is_told_where_the_run_can_not_be_saved(
     monkeypatch.setattr(one.checkpoints, "save", full)
     with pytest.raises(EnvironmentFailure) as failed:
         one.train()
-    assert failed.value is failure
-    assert failure.__notes__ == ["the run could not be saved: the disk is full"]
+    assert failed.value.__cause__ is failure
+    assert failed.value.__notes__ == ["the run could not be saved: the disk is full"]
 
 
 def test_the_second_signal_saves_nothing(training: Callable[..., Training]) -> None:
