@@ -216,7 +216,7 @@ class EnvRunner:
         What stops a run may have reached their processes, too: that they died is no failure then.
 
         Args:
-            steps: that are taken.
+            steps: that are taken; failures then say which.
         """
         with may_be_given_up():
             try:
@@ -224,6 +224,8 @@ class EnvRunner:
             except EnvironmentFailure as failure:
                 if self._stop_requested():
                     raise StopRequested from failure
+                if not steps:
+                    raise
                 step = self.step_count + steps
                 raise EnvironmentFailure(f"step {step}: {failure}") from failure
 

@@ -136,6 +136,23 @@ def poisoned(values: Any, at: tuple[int, ...], by: float) -> np.ndarray:
     return array
 
 
+def test_what_a_reset_fails_of_keeps_its_kind(
+    scripted: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class NoSceneError(EnvironmentFailure, ValueError):
+        pass
+
+    def reset(**options: Any) -> Any:
+        raise NoSceneError("no scene fits")
+
+    env_runner = begun(script(scripted))
+    monkeypatch.setattr(env_runner.env, "reset", reset)
+    with pytest.raises(
+        NoSceneError, match=r"^no scene fits$"
+    ):  # the settings' fault, for a session
+        env_runner.reset()
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_broken_reward_is_named_with_its_step_and_environment(scripted: Any, bad: float) -> None:
     env_runner = begun(script(scripted, reward=poisoned(REWARD, (1, 1), bad)))
