@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
 CORES = len(os.sched_getaffinity(0))
+POLL_S = 1.0
+SIGNALLED = 128
+"""Exit code of a command that a signal ended, less the signal's number, as shells have it."""
+STOPPED = (SIGNALLED + signal.SIGINT, SIGNALLED + signal.SIGTERM)
+"""Exit codes of what was told to stop: a run saves itself, and can go on."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +30,7 @@ class Job:
         results: what the last command writes.
         done: there is nothing to do; None: where the results are.
         folder: where the commands run; None: here.
+        stop: asked every `POLL_S` seconds whether the command that runs is to stop, by SIGTERM.
     """
 
     name: str
@@ -31,11 +38,25 @@ class Job:
     results: Path
     done: bool | None = None
     folder: Path | None = None
+    stop: Callable[[], bool] = lambda: False
 
     @property
     def missing(self) -> bool:
         """Whether there is anything to do."""
         return not (self.results.exists() if self.done is None else self.done)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a job ended.
+
+    Attributes:
+        code: exit code of the last command that ran, as a shell says it.
+        errors: what that wrote to its standard error.
+    """
+
+    code: int
+    errors: str
 
 
 def run_missing(jobs: Sequence[Job], at_once: int) -> int:
@@ -45,30 +66,51 @@ def run_missing(jobs: Sequence[Job], at_once: int) -> int:
     """
     missing = [job for job in jobs if job.missing]
     with ThreadPoolExecutor(at_once) as pool:
-        return max(pool.map(_run, missing), default=0)
+        return max((ended.code for ended in pool.map(run, missing)), default=0)
 
 
-def _run(job: Job) -> int:
-    _say(f"{job.name} begins", sys.stdout)
+def run(job: Job) -> Ended:
+    """Does a job, and tells of its beginning, and of its failure."""
+    say(f"{job.name} begins")
     job.results.parent.mkdir(parents=True, exist_ok=True)
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    ended = Ended(0, "")
     for command in job.commands:
-        done = subprocess.run(
-            [sys.executable, *command],
-            cwd=job.folder,
-            env=environment,
-            check=False,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        if done.returncode:
-            _say(f"{job.name} failed:\n{done.stderr}", sys.stderr)
-            return done.returncode
-    return 0
+        ended = _execute(command, job)
+        if ended.code:
+            break
+    if ended.code not in (0, *STOPPED):
+        say(f"{job.name} failed:\n{ended.errors}", sys.stderr)
+    return ended
 
 
-def _say(line: str, stream: TextIO) -> None:
-    # In one piece: print writes the line's end by itself, and jobs begin side by side.
+def _execute(command: Sequence[str], job: Job) -> Ended:
+    """Runs a command to its end."""
+    process = subprocess.Popen(
+        [sys.executable, *command],
+        cwd=job.folder,
+        env=os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    stopped = False
+    try:
+        while True:
+            try:
+                _, errors = process.communicate(timeout=POLL_S)
+            except subprocess.TimeoutExpired:
+                if not stopped and job.stop():
+                    process.terminate()
+                    stopped = True
+            else:
+                code = process.returncode
+                return Ended(code if code >= 0 else SIGNALLED - code, errors)
+    finally:
+        process.terminate()  # where asking failed; it does nothing to one that has ended
+
+
+def say(line: str, stream: TextIO | None = None) -> None:
+    """Prints a line in one piece: print writes its end by itself, and jobs go side by side."""
+    stream = stream or sys.stdout
     stream.write(f"{line}\n")
     stream.flush()

@@ -97,7 +97,10 @@ def read_run(folder: Path) -> RunResult:
         raise UserError(
             f"{folder / CONFIGURATION}: seed: should be a whole number, not {shown(seed)}"
         )
-    return RunResult(folder, configuration, read_status(folder), _curves(folder))
+    curves = Curves(folder)
+    return RunResult(
+        folder, configuration, read_status(folder), {tag: curves.curve(tag) for tag in curves.tags}
+    )
 
 
 def read_status(folder: Path) -> dict[str, Any]:
@@ -120,19 +123,37 @@ def read_status(folder: Path) -> dict[str, Any]:
     return status
 
 
-def _curves(folder: Path) -> dict[str, Curve]:
-    """Curves of all scalars; what an event file that was cut short still has."""
-    # Imported late: it takes seconds.
-    from tensorboard.backend.event_processing.event_accumulator import (  # noqa: PLC0415
-        EventAccumulator,
-    )
+class Curves:
+    """Curves of a run's scalars, also while it goes on.
 
-    logging.getLogger("tensorboard").setLevel(logging.ERROR)
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
-    curves: dict[str, Curve] = {}
-    for tag in events.Tags()["scalars"]:
-        points = {event.step: event.value for event in events.Scalars(tag)}
+    What an event file that was cut short still has is there.
+
+    Args:
+        folder: the run's, which exists.
+    """
+
+    def __init__(self, folder: Path):
+        # Imported late: it takes seconds.
+        from tensorboard.backend.event_processing.event_accumulator import (  # noqa: PLC0415
+            EventAccumulator,
+        )
+
+        logging.getLogger("tensorboard").setLevel(logging.ERROR)
+        self._events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+        self.reload()
+
+    def reload(self) -> None:
+        """Reads what was logged since."""
+        self._events.Reload()
+
+    @property
+    def tags(self) -> list[str]:
+        """Names of the curves."""
+        return list(self._events.Tags()["scalars"])
+
+    def curve(self, tag: str) -> Curve:
+        """One of them."""
+        points = {event.step: event.value for event in self._events.Scalars(tag)}
         steps = sorted(points)
         values = np.array([points[step] for step in steps], np.float64)
-        curves[tag] = np.array(steps, np.int64), values
-    return curves
+        return np.array(steps, np.int64), values

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
 
-from trainers.comparison.jobs import Job, run_missing
+from trainers.comparison import jobs
+from trainers.comparison.jobs import Job, run, run_missing
 
 APPEND = "import os, sys; open(sys.argv[1], 'a').write(sys.argv[2] + os.environ['OMP_NUM_THREADS'])"
 
@@ -47,3 +49,50 @@ def test_lines_of_jobs_side_by_side_are_not_torn(
     monkeypatch.setattr("sys.stdout.write", writes.append)
     run_missing([append(tmp_path / "first.json", "a")], at_once=1)
     assert writes == ["first begins\n"]
+
+
+SAVES = """
+import os, signal, sys, time
+def save(number, frame):
+    open(sys.argv[1], "w").close()
+    os._exit(143)
+signal.signal(signal.SIGTERM, save)
+open(sys.argv[2], "w").close()
+time.sleep(60)
+"""
+
+
+def test_a_job_that_is_to_stop_is_told_and_saves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(jobs, "POLL_S", 0.02)
+    saved, ready = tmp_path / "saved", tmp_path / "ready"
+    job = Job("long", [["-c", SAVES, str(saved), str(ready)]], saved, stop=ready.exists)
+    assert run(job).code == 143
+    assert saved.exists()
+    assert not capsys.readouterr().err
+
+
+def test_a_job_whose_watching_fails_is_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jobs, "POLL_S", 0.02)
+    saved, ready = tmp_path / "saved", tmp_path / "ready"
+
+    def stop() -> bool:
+        if ready.exists():
+            raise ConnectionError("lost")
+        return False
+
+    job = Job("long", [["-c", SAVES, str(saved), str(ready)]], saved, stop=stop)
+    with pytest.raises(ConnectionError):
+        run(job)
+    for _ in range(500):
+        time.sleep(0.0 if saved.exists() else 0.02)
+    assert saved.exists()
+
+
+def test_a_job_that_a_signal_ended_has_the_exit_code_that_shells_give(tmp_path: Path) -> None:
+    kill = ["-c", "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"]
+    killed = Job("killed", [kill], tmp_path / "none")
+    assert run_missing([killed, append(tmp_path / "other", "b")], at_once=1) == 137

@@ -10,7 +10,7 @@ import pytest
 
 from trainers.common.errors import UserError
 from trainers.comparison import results
-from trainers.comparison.results import REWARD, SPEED, RunResult, read_run, read_status
+from trainers.comparison.results import REWARD, SPEED, Curves, RunResult, read_run, read_status
 from trainers.reporting.event_log import RunLog
 from trainers.saving.run_folder import CONFIGURATION
 
@@ -97,3 +97,20 @@ def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
 
 def test_without_an_evaluation_there_is_none() -> None:
     assert RunResult(Path(), {}, {"evaluation": None}).evaluation == {}
+
+
+def test_curves_of_a_run_that_goes_on_grow(tmp_path: Path) -> None:
+    log = RunLog(tmp_path)
+    curves = Curves(tmp_path)
+    assert curves.tags == []
+    for step in (10, 20):
+        log.scalars({"a": step / 10.0}, step)
+        curves.reload()
+        assert curves.curve("a")[0].tolist() == list(range(10, step + 1, 10))
+    log.close()
+    # Taken up from step 10, in another file.
+    log = RunLog(tmp_path, resumed_at=10)
+    log.scalars({"a": 5.0}, 20)
+    log.close()
+    curves.reload()
+    assert [part.tolist() for part in curves.curve("a")] == [[10, 20], [1.0, 5.0]]
