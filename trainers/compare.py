@@ -95,9 +95,9 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         metavar="CONFIG_OR_FOLDER",
         help="run files, folders of them, or the folders of runs made elsewhere",
     )
-    parser.add_argument("--seeds", type=_positive, default=3, help="runs of each run file")
-    parser.add_argument("--max-steps", type=_positive, help="overrides trainer.max_steps")
-    parser.add_argument("--jobs", type=_positive, default=CORES, help="runs at a time")
+    parser.add_argument("--seeds", type=positive, default=3, help="runs of each run file")
+    parser.add_argument("--max-steps", type=positive, help="overrides trainer.max_steps")
+    parser.add_argument("--jobs", type=positive, default=CORES, help="runs at a time")
     parser.add_argument("--report", type=Path, metavar="FOLDER", help="default: with the runs")
     parser.add_argument(
         "--results-dir", type=Path, default=Path("results/compare"), help="where runs are kept"
@@ -105,7 +105,8 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_intermixed_args(arguments)
 
 
-def _positive(text: str) -> int:
+def positive(text: str) -> int:
+    """A count, as the command line has it."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"should be a whole number from 1, not {text!r}")
     return int(text)

@@ -13,7 +13,7 @@ from trainers.common.timers import timed
 from trainers.evaluation import evaluate_policy, evaluation_environment
 from trainers.inference.policy import Policy
 from trainers.reporting.event_log import RunLog
-from trainers.reporting.figures import figure_values
+from trainers.reporting.figures import evaluation_tag, figure_values
 from trainers.runfile.settings import EvaluationSettings, RunSettings
 from trainers.session import Session
 
@@ -153,7 +153,4 @@ def _check_interval(settings: EvaluationSettings, collection_steps: int) -> None
 
 def _tagged(report: Mapping[str, Any]) -> dict[str, float]:
     """Figures by their TensorBoard tags."""
-    return {
-        f"Evaluation/{f'{name} {part}'.strip().replace('_', ' ').title()}": value
-        for name, part, value in figure_values(report)
-    }
+    return {evaluation_tag(name, part): value for name, part, value in figure_values(report)}

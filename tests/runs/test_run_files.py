@@ -12,7 +12,7 @@ from trainers.runfile.settings import load_run
 from trainers.session import Session
 
 CONFIG = Path(__file__).parents[2] / "config"
-FILES = sorted(CONFIG.rglob("*.yaml"))
+FILES = sorted({*CONFIG.rglob("*.yaml")} - {*CONFIG.glob("sweeps/*.yaml")})
 GYMNASIUM = sorted(CONFIG.glob("gymnasium/*.yaml"))
 
 

@@ -6,12 +6,13 @@ import json
 import logging
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
 
 from trainers.common.files import naming, write_atomically
 from trainers.reporting.event_files import cut_after
@@ -81,6 +82,20 @@ class RunLog:
             step: environment steps taken.
         """
         self._write(lambda writer: writer.add_image(tag, image, step, dataformats="HWC"))
+
+    def hparams(self, values: Mapping[str, str | float], tags: Sequence[str]) -> None:
+        """Log what runs are told apart by, for TensorBoard's page HParams.
+
+        Args:
+            values: by name; of this run.
+            tags: of the curves that runs are compared by.
+        """
+
+        def add(writer: SummaryWriter) -> None:
+            for summary in hparams(dict(values), dict.fromkeys(tags, 0.0)):
+                writer._get_file_writer().add_summary(summary)
+
+        self._write(add)
 
     def status(self, values: Mapping[str, Any]) -> None:
         """Rewrite `status.json`; a reader sees the old content or the new, never a part.

@@ -33,6 +33,11 @@ def figure_values(report: Mapping[str, Any]) -> Iterator[tuple[str, str, float]]
             yield from ((key, part, float(number)) for part, number in parts if number is not None)
 
 
+def evaluation_tag(key: str, part: str = "") -> str:
+    """The TensorBoard tag of a report's figure."""
+    return f"Evaluation/{f'{key} {part}'.strip().replace('_', ' ').title()}"
+
+
 def report_figures(evaluator: Evaluator) -> dict[str, Figure]:
     """Figures of a report's entries, by their keys; what is not here is a plain number."""
     name, label = evaluator.check_name, evaluator.check_name.replace("_", " ")

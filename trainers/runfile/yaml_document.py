@@ -121,6 +121,20 @@ class Document:
         if not equals or not all(key.split(".")):
             message = "not KEY=VALUE; write for example trainer.max_steps=1000"
             raise SettingsError([Problem(place, (), message)])
+        self.set(key, parse(value, place).data, place)
+
+    def set(self, key: str, value: Any, place: str) -> None:
+        """Set one value.
+
+        Args:
+            key: a dotted path, see `override`.
+            value: plain data.
+            place: where it was written.
+
+        Raises:
+            SettingsError: KEY leads through a value that has no keys or to an item that a list
+                does not have.
+        """
         target = self.data
         path: KeyPath = ()
         *sections, last = key.split(".")
@@ -133,7 +147,7 @@ class Document:
             target = target[index]
         index = self._index(target, path, last, place)
         path = (*path, index)
-        target[index] = parse(value, place).data
+        target[index] = value
         # What was written about the old value's parts is out of date.
         self.places = {
             known: line for known, line in self.places.items() if known[: len(path)] != path

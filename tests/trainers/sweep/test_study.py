@@ -1,0 +1,96 @@
+"""Optuna's part of a sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trainers.common.errors import UserError
+from trainers.runfile.registry import Registries
+from trainers.sweep.plan import load_sweep
+from trainers.sweep.study import distributions, open_study, shown_storage
+
+RATE, BATCH = "trainer.hyperparameters.learning_rate", "trainer.hyperparameters.batch_size"
+GRID = {RATE: {"choice": [1e-3, 1e-2]}, BATCH: {"choice": [16, 32]}}
+
+
+def params_of(sweep: Any, storage: Path, count: int) -> list[dict[str, Any]]:
+    """Values of the next so many trials of a process that begins now."""
+    study = open_study(sweep, str(storage))
+    found = []
+    for _ in range(count):
+        trial = study.ask(distributions(sweep))
+        found.append(trial.params)
+        study.tell(trial, trial.params[BATCH] - trial.params[RATE])
+    return found
+
+
+@pytest.mark.parametrize("sampler", ["random", "tpe"])
+def test_what_is_drawn_depends_on_the_trials_number_and_not_on_its_process(
+    sampler: str, sweep_file: Callable[..., Path], known: Registries, tmp_path: Path
+) -> None:
+    sweep = load_sweep(sweep_file(sampler=sampler), known)
+    whole = params_of(sweep, tmp_path / "whole.journal", 14)
+    # Beyond the first ten, TPE draws by what became of the others.
+    parts = [params_of(sweep, tmp_path / "parts.journal", count) for count in (3, 9, 2)]
+    assert [values for part in parts for values in part] == whole
+    assert len({values[RATE] for values in whole}) == 14
+    ranks = [sorted(values[RATE] for values in whole).index(values[RATE]) for values in whole]
+    assert {values[BATCH] for values in whole} == {16, 32}
+    assert ranks != sorted(ranks)
+
+
+def test_processes_that_ask_together_share_a_grid(
+    sweep_file: Callable[..., Path], known: Registries, tmp_path: Path
+) -> None:
+    sweep = load_sweep(sweep_file(sampler="grid", space=GRID), known)
+    studies = [open_study(sweep, str(tmp_path / "journal")) for _ in range(2)]
+    asked = [study.ask(distributions(sweep)) for _ in range(2) for study in studies]
+    assert [trial.params for trial in asked] == sweep.cells
+
+
+def test_a_sweep_of_the_same_name_is_refused_if_it_is_another(
+    sweep_file: Callable[..., Path], known: Registries, tmp_path: Path
+) -> None:
+    storage = str(tmp_path / "journal")
+    open_study(load_sweep(sweep_file(), known), storage)
+    open_study(load_sweep(sweep_file(trials=50, pruner="none"), known), storage)
+    other = load_sweep(sweep_file(fixed={"trainer.max_steps": 512}), known)
+    with pytest.raises(UserError, match=r"another sweep .*'pole': run\.trainer\.max_steps differs"):
+        open_study(other, storage)
+
+
+@pytest.mark.parametrize(
+    ("storage", "message"),
+    [
+        ("sqlite:////nowhere/at/all.db", "unable to open database file"),
+        ("nosuch://user:secret@host/db", "Can't load plugin"),
+        ("://", "Could not parse SQLAlchemy URL"),
+        ("run.yaml/study.journal", "File exists"),
+        ("run.yaml", "Expecting value"),
+    ],
+)
+def test_storages_that_cannot_be_used_are_told_in_a_line(
+    storage: str,
+    message: str,
+    sweep_file: Callable[..., Path],
+    known: Registries,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sweep = load_sweep(sweep_file(), known)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=r"^--storage .*: can't be used: ") as caught:
+        open_study(sweep, storage)
+    said = str(caught.value)
+    assert message in said
+    assert "secret" not in said
+    assert "\n" not in said
+
+
+def test_a_password_is_not_shown() -> None:
+    assert shown_storage("postgresql://me:secret@host/db") == "postgresql://me:***@host/db"
+    assert shown_storage("a/file.journal") == "a/file.journal"
