@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from envs.environment import Environment
 from trainers.common.timers import timed
-from trainers.networks.observations import is_frame
+from trainers.networks.observations import is_image
 
 Indices = int | Iterable[int] | None
 Arrays = NDArray[Any] | dict[str, NDArray[Any]]
@@ -90,7 +90,7 @@ class PeerVecEnv(VecEnv):
 
 def _space(space: gymnasium.Space[Any]) -> gymnasium.Space[Any]:
     """The space of one observation with the channels of images first."""
-    if isinstance(space, Box) and is_frame(space):
+    if isinstance(space, Box) and is_image(space):
         low, high = np.moveaxis(space.low, -1, 0), np.moveaxis(space.high, -1, 0)
         return Box(low, high, dtype=space.dtype)
     return space

@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from torch import nn
 from torch.nn import functional as F
 
-from encoders.spaces import DepthImage, low_and_span
+from encoders.spaces import DepthImage, PointCloud, low_and_span
 
 # Farther than any camera sees, and no less exact a number than a depth.
 FAR_AWAY_M = 1e4
@@ -234,6 +234,8 @@ def vector_input(space: Box) -> VectorInput:
 
 
 def _neither(space: Box) -> str:
+    if isinstance(space, PointCloud):
+        return f"{space} is of point clouds, neither images nor vectors: use the encoder 'pointnet'"
     return (
         f"an observation of shape {space.shape} is neither a vector (n,) nor an image (height, "
         "width, channels): no encoder takes it; reshape it in the environment"

@@ -12,7 +12,7 @@ from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
 from encoders.cameras import Pinhole, Sampling
-from encoders.spaces import DepthImage, RgbImage
+from encoders.spaces import DepthImage, PointCloud, RgbImage
 
 Plain = dict[str, Any]
 LARGEST_IMAGE, LARGEST_VECTOR = 2**26, 2**20
@@ -48,6 +48,13 @@ def space_to_plain(space: gymnasium.Space[Any]) -> Plain:
                 "height": space.shape[0],
                 "width": space.shape[1],
                 "sampling": _fields(space.sampling),
+            }
+        case PointCloud():
+            return {
+                "type": "point_cloud",
+                "points": space.shape[0],
+                "frame": space.frame,
+                "middle_m": list(space.middle_m),
             }
         case Box():
             return {
@@ -86,6 +93,8 @@ def space_from_plain(plain: Plain) -> gymnasium.Space[Any]:
         case "rgb_image":
             _check_shape([fields["height"], fields["width"], 3])
             return RgbImage(**{**fields, "sampling": _sampling(fields.get("sampling"))})
+        case "point_cloud":
+            return PointCloud(**{**fields, "middle_m": tuple(fields["middle_m"])})
         case "box":
             return _box(fields)
     raise ValueError(f"a space of the unknown type {plain['type']!r}")

@@ -1,4 +1,4 @@
-"""Image spaces that say what their numbers mean: depth in metres, and RGB."""
+"""Spaces that say what their numbers mean: images of depths and colours, and point clouds."""
 
 from __future__ import annotations
 
@@ -28,6 +28,10 @@ LARGEST_BOUND = float(np.finfo(np.float32).max)
 """Of floats: spaces that have no bounds say so with this, too."""
 
 DepthEncoding = Literal["uint8", "uint16"]
+Frame = Literal["camera", "base"]
+
+COORDINATES = 3
+CLOUD_PICTURE_PX = 120
 
 
 class DepthImage(Box):
@@ -158,16 +162,11 @@ class DepthImage(Box):
         Returns:
             RGB (height, width, 3): near is warm, far is cold, "nothing seen" is gray.
         """
-        # Here, because simulators' processes import this module and do without.
-        import cv2  # noqa: PLC0415
-
         first, last = self.codes
         codes = frame[..., 0].astype(np.float64)
-        nearness = ((last - codes) / max(last - first, 1)).clip(0.0, 1.0)
-        levels = np.rint(nearness * UINT8_MAX).astype(np.uint8)
-        rgb = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
+        rgb = warm_to_cold(((last - codes) / max(last - first, 1)).clip(0.0, 1.0))
         rgb[(codes < first) | (codes > last)] = NOTHING_SEEN_RGB
-        return np.asarray(rgb, np.uint8)
+        return rgb
 
     def __eq__(self, other: Any) -> bool:
         """Two depth spaces are equal when their numbers mean the same, too."""
@@ -225,6 +224,90 @@ class RgbImage(Box):
     def __repr__(self) -> str:
         """Gives the size; everything else is fixed."""
         return f"RgbImage({self.shape[0]}, {self.shape[1]}{_said(self.sampling)})"
+
+
+class PointCloud(Box):
+    """Clouds of shape (points, 4), float32: x, y and z in metres, and 1; or four zeros.
+
+    Four zeros are no point: every cloud has as many rows, however few points there are. The order
+    of the rows means nothing.
+
+    Args:
+        points: Rows of a cloud.
+        frame: Whose axes the coordinates are along: the camera's (x right, y down, z forward), or
+            the robot's base's (x forward, y left, z up).
+        middle_m: A point of that frame in the middle of what is seen; encoders count from it.
+
+    Raises:
+        ValueError: There is not a single row, the frame is unknown, or the middle is no point.
+    """
+
+    def __init__(
+        self,
+        points: int,
+        frame: Frame = "camera",
+        middle_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        if points < 1:
+            raise ValueError(f"a cloud needs room for at least one point, not for {points}")
+        if frame not in ("camera", "base"):
+            raise ValueError(f"the frame {frame!r} of a cloud is unknown: use 'camera' or 'base'")
+        if len(middle_m) != COORDINATES or not np.isfinite(middle_m).all():
+            raise ValueError(f"middle_m {middle_m} must be three finite numbers")
+        low, high = np.zeros((points, COORDINATES + 1)), np.ones((points, COORDINATES + 1))
+        low[:, :COORDINATES], high[:, :COORDINATES] = -np.inf, np.inf
+        super().__init__(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+        self.frame: Frame = frame
+        self.middle_m = (float(middle_m[0]), float(middle_m[1]), float(middle_m[2]))
+
+    def picture(self, cloud: NDArray[np.floating]) -> NDArray[np.uint8]:
+        """Draws one cloud (points, 4) for people, as the camera sees it or from above the base.
+
+        Returns:
+            RGB (120, 120, 3) of all points without perspective: near is warm, far is cold, and
+            where there is no point it is gray.
+        """
+        shape = (CLOUD_PICTURE_PX, CLOUD_PICTURE_PX, COORDINATES)
+        drawn = np.full(shape, NOTHING_SEEN_RGB, np.uint8)
+        points = cloud[cloud[:, COORDINATES] > 0.0, :COORDINATES].astype(np.float64)
+        if not len(points):
+            return drawn
+        # From above, forward is up and the left is on the left.
+        across, down, away = points.T if self.frame == "camera" else -points[:, [1, 0, 2]].T
+        pixel_m = max(np.ptp(across), np.ptp(down), 1e-9) / (CLOUD_PICTURE_PX - 1)
+        rows, columns = (
+            np.rint((along - along.min()) / pixel_m).astype(np.int64) for along in (down, across)
+        )
+        nearness = (away.max() - away) / max(np.ptp(away), 1e-9)
+        order = np.argsort(nearness)  # the nearest is drawn last
+        drawn[rows[order], columns[order]] = warm_to_cold(nearness[order])
+        return drawn
+
+    def __eq__(self, other: Any) -> bool:
+        """Two are equal when their numbers mean the same, too."""
+        return isinstance(other, PointCloud) and self._key == other._key
+
+    def __hash__(self) -> int:
+        """Agrees with equality."""
+        return hash(self._key)
+
+    def __repr__(self) -> str:
+        """Says what the numbers mean, where a Box would list its bounds."""
+        return f"PointCloud({self.shape[0]}, {self.frame!r}, middle_m={self.middle_m})"
+
+    @property
+    def _key(self) -> tuple[int, str, tuple[float, float, float]]:
+        return self.shape[0], self.frame, self.middle_m
+
+
+def warm_to_cold(nearness: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Colors (..., 3) of what is as near as can be, 1, and as far, 0; of shape (...)."""
+    # Here, because simulators' processes import this module and do without.
+    import cv2  # noqa: PLC0415
+
+    levels = np.rint(nearness * UINT8_MAX).astype(np.uint8)
+    bgr = cv2.applyColorMap(levels.reshape(-1, 1), cv2.COLORMAP_TURBO)
+    return np.asarray(bgr[:, 0, ::-1], np.uint8).reshape(*nearness.shape, 3)
 
 
 def bounded(space: Box) -> NDArray[np.bool_]:

@@ -26,6 +26,7 @@ from trainers.experience.frames import frame_spaces
 from trainers.inference.construction import network_factory
 from trainers.inference.metadata import Metadata
 from trainers.networks.factory import NetworkFactory
+from trainers.networks.observations import is_image
 from trainers.reporting.summary import RunPosition
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import Component, RunSettings
@@ -226,7 +227,7 @@ def _warn_of_what_learns_badly(run: RunSettings, env: Environment) -> None:
             run.environment.name,
         )
     for name, space in frame_spaces(env.single_observation_space).items():
-        if isinstance(space, Box) and not bounded(space).all():
+        if isinstance(space, Box) and is_image(space) and not bounded(space).all():
             _logger.warning(
                 "observation %r: images without bounds are taken as they are: declare bounds in "
                 "the environment's space, and they are scaled to [0, 1], as networks need it",

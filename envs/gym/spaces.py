@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
-from encoders.spaces import DepthImage, RgbImage
+from encoders.spaces import DepthImage, PointCloud, RgbImage
 from envs.environment import ObservationArrays
 
 Channels = Literal["first", "last"] | None
@@ -109,7 +109,7 @@ def _part(name: str, space: gymnasium.Space[Any], channels: Channels) -> Part:
             return _one_hot(space)
         case Box() if len(space.shape) <= 1:
             return _vector(space)
-        case DepthImage() | RgbImage():
+        case DepthImage() | RgbImage() | PointCloud():
             return Part(space, lambda batch: np.array(batch, space.dtype))
         case Box() if len(space.shape) == 3:
             return _image(name, space, channels)

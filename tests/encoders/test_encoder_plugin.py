@@ -8,7 +8,7 @@ from torch import nn
 
 from encoders import plugin
 from encoders.cameras import Pinhole
-from encoders.spaces import DepthImage
+from encoders.spaces import DepthImage, PointCloud
 from trainers import hookspecs
 
 
@@ -30,6 +30,7 @@ def test_all_built_in_encoders_are_registered():
         "fully_connected",
         "keypoints",
         "second_look",
+        "pointnet",
         "vector",
     }
 
@@ -47,8 +48,8 @@ def test_contract(name):
             setattr(settings, field, 1)
     with pytest.raises(ValidationError, match="extra"):
         encoder.Settings(**required, no_such_setting=1)
-    pinhole = Pinhole(99.0, 99.0, 40.0, 40.0)
-    space = Box(-1, 1, (6,)) if name == "vector" else DepthImage(80, 80, pinhole=pinhole)
-    built = encoder(space, settings)
+    image = DepthImage(80, 80, pinhole=Pinhole(99.0, 99.0, 40.0, 40.0))
+    others = {"vector": Box(-1, 1, (6,)), "pointnet": PointCloud(9)}
+    built = encoder(others.get(name, image), settings)
     assert isinstance(built, nn.Module)
     assert isinstance(built.features_dim, int)

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary
 
 from encoders.cameras import Pinhole, Sampling
 from encoders.saved_spaces import space_from_plain, space_to_plain
-from encoders.spaces import DepthImage, RgbImage
+from encoders.spaces import DepthImage, PointCloud, RgbImage
 
 
 @pytest.mark.parametrize(
@@ -34,6 +34,7 @@ from encoders.spaces import DepthImage, RgbImage
             Sampling(640, 480, 1, 2, 64, 48, 9),
         ),
         DepthImage(48, 64),
+        PointCloud(7, "base", (0.1, -0.2, 0.3)),
         RgbImage(2, 3),
         RgbImage(2, 3, Sampling(9, 9, 0, 0, 3, 2, 3)),
         Dict({"b": Box(0.0, 1.0, (2,), np.float32), "a": RgbImage(1, 1)}),

@@ -10,6 +10,9 @@ from torch import Tensor
 
 from trainers.networks.observations import Observations, gather
 
+# Of a batch. Clouds have one fewer, and no pixels.
+IMAGE_DIMENSIONS = 4
+
 Augmentation = Callable[[Observations], Observations]
 
 
@@ -19,12 +22,12 @@ def unchanged(observations: Observations) -> Observations:
 
 
 class RandomShift:
-    """Shifts every frame by up to some pixels (Kostrikov et al. 2020, arXiv:2004.13649).
+    """Shifts every image by up to some pixels (Kostrikov et al. 2020, arXiv:2004.13649).
 
     Images of one observation are shifted apart; what comes into view repeats the edge.
 
     Args:
-        pixels: the furthest a frame is shifted, along each axis.
+        pixels: the furthest an image is shifted, along each axis.
         generator: the source of randomness.
     """
 
@@ -33,7 +36,10 @@ class RandomShift:
 
     def __call__(self, observations: Observations) -> Observations:
         """The same observations with other frames."""
-        frames = {name: self._shifted(images) for name, images in observations.frames.items()}
+        frames = {
+            name: self._shifted(frames) if frames.ndim == IMAGE_DIMENSIONS else frames
+            for name, frames in observations.frames.items()
+        }
         return dataclasses.replace(observations, frames=frames)
 
     def _shifted(self, images: Tensor) -> Tensor:

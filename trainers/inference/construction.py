@@ -9,6 +9,7 @@ import gymnasium
 from pydantic import BaseModel
 from torch import Tensor, nn
 
+from encoders.spaces import PointCloud
 from trainers.common.errors import UserError, first_lines
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.network import NetworkSettings
@@ -20,6 +21,7 @@ from trainers.saving.serialization import mismatch
 Model = TypeVar("Model", bound=BaseModel)
 
 DEFAULT_IMAGE_ENCODER = "simple"
+DEFAULT_CLOUD_ENCODER = "pointnet"
 DEFAULT_VECTOR_ENCODER = "vector"
 
 
@@ -101,7 +103,10 @@ def in_float32(settings: Model) -> Model:
 def _default_encoder(
     space: gymnasium.Space[Any], settings: NetworkSettings, registry: Registry
 ) -> Component:
-    name = DEFAULT_IMAGE_ENCODER if is_frame(space) else DEFAULT_VECTOR_ENCODER
+    if isinstance(space, PointCloud):
+        name = DEFAULT_CLOUD_ENCODER
+    else:
+        name = DEFAULT_IMAGE_ENCODER if is_frame(space) else DEFAULT_VECTOR_ENCODER
     entry = registry.get(name)
     options = {} if is_frame(space) else {"normalize": settings.normalize}
     return Component(name, entry.cls, entry.settings(**options))

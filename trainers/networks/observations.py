@@ -1,7 +1,7 @@
 """Observations on the learner's side: tensors, with each distinct frame once.
 
-Images are *frames*: many steps may share one, so they are kept apart and referred to by index.
-Vectors change every step and are kept as they are.
+Images and point clouds are *frames*: many steps may share one, so they are kept apart and referred
+to by index. Vectors change every step and are kept as they are.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from encoders.spaces import PointCloud
 from trainers.networks.recurrent import Sequences
 
 IMAGE_DIMENSIONS = 3
@@ -26,7 +27,7 @@ class Observations:
     """B observations.
 
     Attributes:
-        frames: by name, images (U, H, W, C) in their own type.
+        frames: by name, images (U, H, W, C) or clouds (U, P, 4) in their own type.
         vectors: by name, (B, n).
         frame_index: (B,) which of the U frames belongs to each; None: U = B, in this order.
         sequences: which of them follow each other, and the hidden state before; None: each is the
@@ -40,6 +41,11 @@ class Observations:
 
 
 def is_frame(space: gymnasium.Space[Any]) -> bool:
+    """Whether observations of a space are images or point clouds."""
+    return is_image(space) or isinstance(space, PointCloud)
+
+
+def is_image(space: gymnasium.Space[Any]) -> bool:
     """Whether observations of a space are images."""
     return space.shape is not None and len(space.shape) == IMAGE_DIMENSIONS
 
@@ -77,5 +83,6 @@ def frames_differ(
     """Whether any of the frames of these names differ between two batches, at some rows."""
     differ = np.zeros(len(rows), bool)
     for name in names:
-        differ |= (first[name][rows] != second[name][rows]).any(axis=(1, 2, 3))
+        unequal = first[name][rows] != second[name][rows]
+        differ |= unequal.any(axis=tuple(range(1, unequal.ndim)))
     return differ

@@ -23,7 +23,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from encoders.cameras import Pinhole
-from encoders.spaces import DepthImage, RgbImage
+from encoders.spaces import DepthImage, PointCloud, RgbImage
 from envs.gym.spaces import ActionAdapter, ObservationAdapter
 
 LARGEST = np.finfo(np.float64).max
@@ -64,6 +64,14 @@ def test_entries_keep_their_meaning() -> None:
         "colors": ((6, 5, 3), np.uint8),
         "depth": ((6, 5, 1), np.float32),
     }
+
+
+def test_clouds_stay_what_they_are() -> None:
+    space = PointCloud(2, "base", (1.0, 2.0, 3.0))
+    adapter = ObservationAdapter(Dict({"cloud": space}))
+    assert adapter.space["cloud"] == space
+    clouds = np.float32([[[1, 2, 3, 1], [0, 0, 0, 0]]])
+    np.testing.assert_array_equal(adapter({"cloud": clouds})["cloud"], clouds)
 
 
 def test_bounds_beyond_float32_are_none() -> None:

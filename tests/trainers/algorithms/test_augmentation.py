@@ -41,6 +41,14 @@ def test_every_image_is_a_crop_of_itself_with_repeated_edges(dtype: type) -> Non
     assert (found == 1).all()
 
 
+def test_clouds_have_no_pixels_to_be_shifted() -> None:
+    cloud = torch.randn(5, 9, 4)
+    observations = Observations({"eye": images(5, np.uint8), "cloud": cloud}, {})
+    shifted = RandomShift(2, torch.Generator().manual_seed(0))(observations)
+    assert shifted.frames["cloud"] is cloud
+    assert (shifted.frames["eye"] != observations.frames["eye"]).any()
+
+
 def test_cameras_are_shifted_apart_and_repeatably() -> None:
     frames = images(50, np.uint8)
     observations = Observations({"left": frames, "right": frames}, {})

@@ -18,8 +18,9 @@ from encoders.cameras import Pinhole, Sampling
 from encoders.conv import Conv, Paper
 from encoders.keypoints import Keypoints
 from encoders.ml_agents import FullyConnected, NatureCnn, ResNet, Simple
+from encoders.pointnet import PointNet
 from encoders.second_look import SecondLook
-from encoders.spaces import DepthImage, RgbImage
+from encoders.spaces import DepthImage, PointCloud, RgbImage
 from encoders.vector import Vector
 from envs.deployment import Deployment
 from trainers.common.errors import UserError
@@ -47,6 +48,7 @@ EVERYTHING = {
     "paper": (DEPTH, Paper, {"validity_channel": True}),
     "keypoints": (DEPTH, Keypoints, {"keypoints": 3, "precision": "float32"}),
     "second_look": (DEPTH, SecondLook, {"first_keypoints": 3, "second_keypoints": 3}),
+    "pointnet": (PointCloud(50, "base", (0.1, 0.2, 0.3)), PointNet, {"layers": (6, 5)}),
     "conv": (COLOR, Conv, {"layers": [(4, 8, 4)]}),
     "simple": (CODED, Simple, {"features": 5}),
     "nature_cnn": (COLOR, NatureCnn, {"features": 5}),
@@ -146,6 +148,7 @@ def test_the_file_says_what_it_is_and_needs_nothing_of_ours(everything: Any) -> 
     shapes = {one.name: (one.type, one.shape) for one in session.get_inputs()}
     assert shapes["paper"] == ("tensor(uint16)", [1, 80, 90])
     assert shapes["conv"] == ("tensor(uint8)", [1, 80, 90, 3])
+    assert shapes["pointnet"] == ("tensor(float)", [1, 50, 4])
     assert shapes["vector"] == ("tensor(float)", [1, 3])
     assert shapes["hidden_state"] == ("tensor(float)", [1, raw.state_size])
     properties = session.get_modelmeta().custom_metadata_map

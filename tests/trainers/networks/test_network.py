@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from encoders.conv import Conv
-from encoders.spaces import RgbImage
+from encoders.spaces import PointCloud, RgbImage
 from encoders.vector import Vector
 from trainers.common.errors import UserError
 from trainers.networks.factory import NetworkFactory
@@ -139,6 +139,17 @@ def test_normalize_reaches_vectors_without_an_encoder_of_their_own(
     network.update_statistics({"joints": batch, "speeds": batch})
     hidden = network(Observations({}, {"joints": batch, "speeds": batch}))
     torch.testing.assert_close(hidden, torch.tensor([[-1.0, -1.0, 1.0, 2.0], [1.0, 1.0, 3.0, 6.0]]))
+
+
+def test_clouds_have_an_encoder_by_default(make_factory: MakeFactory) -> None:
+    factory = make_factory({"joints": SPACES["joints"], "cloud": PointCloud(5)})
+    network = factory.network(BARE, ["joints", "cloud"])
+    clouds = torch.zeros(3, 5, 4)
+    clouds[:, 1:3] = torch.tensor([0.3, 0.1, 0.9, 1.0])
+    features = network(Observations({"cloud": clouds}, {"joints": torch.ones(3, 2)}))
+    assert features.shape == (3, 2 + 128)
+    swapped = Observations({"cloud": clouds.flip(1)}, {"joints": torch.ones(3, 2)})
+    torch.testing.assert_close(network(swapped), features)
 
 
 def test_statistics_pass_by_encoders_that_have_none(make_factory: MakeFactory) -> None:

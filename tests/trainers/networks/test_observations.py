@@ -8,8 +8,8 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
-from encoders.spaces import DepthImage, RgbImage
-from trainers.networks.observations import is_frame, to_tensors
+from encoders.spaces import DepthImage, PointCloud, RgbImage
+from trainers.networks.observations import frames_differ, is_frame, to_tensors
 
 SPACE = gymnasium.spaces.Dict(
     {
@@ -36,15 +36,25 @@ def some_observations(count: int) -> dict[str, np.ndarray]:
         (DepthImage(4, 4), True),
         (RgbImage(4, 4), True),
         (Box(0.0, 1.0, (4, 4, 2), np.float32), True),
+        (PointCloud(4), True),
         (Box(0.0, 1.0, (4, 4), np.float32), False),
         (Box(0.0, 1.0, (4,), np.float32), False),
         (gymnasium.spaces.Discrete(3), False),
     ],
 )
-def test_images_are_frames_and_nothing_else_is(
+def test_images_and_clouds_are_frames_and_nothing_else_is(
     space: gymnasium.Space[object], expected: bool
 ) -> None:
     assert is_frame(space) is expected
+
+
+def test_frames_differ_where_one_number_of_any_of_them_does() -> None:
+    first = {"image": np.zeros((4, 2, 3, 1), np.uint8), "cloud": np.zeros((4, 5, 4), np.float32)}
+    second = {name: frames.copy() for name, frames in first.items()}
+    second["image"][0, 1, 2] = second["cloud"][3, 4, 0] = 1
+    found = frames_differ(first, second, first, np.array([0, 1, 3]))
+    assert found.tolist() == [True, False, True]
+    assert frames_differ(first, second, first, np.array([], np.int64)).tolist() == []
 
 
 def test_frames_and_vectors_are_told_apart_and_keep_their_values_and_types() -> None:
