@@ -111,7 +111,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def depth_cameras(run: RunSettings) -> list[str]:
-    """Names of a run's depth cameras.
+    """Names of a run's cameras that measure depth.
 
     Raises:
         UserError: the policy is none whose first action is to be right, or sees no depth.
@@ -119,7 +119,7 @@ def depth_cameras(run: RunSettings) -> list[str]:
     settings = run.environment.settings
     if not isinstance(settings, GraspSettings):
         raise UserError("only a policy of `environment: {type: grasp}` has first actions to judge")
-    names = [name for name, camera in settings.cameras.items() if camera.type == "depth"]
+    names = [name for name, camera in settings.cameras.items() if camera.type != "rgb"]
     if not names:
         raise UserError("the policy sees no depth, and the faults are those of depth cameras")
     return names

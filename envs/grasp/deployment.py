@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from encoders.spaces import MM_PER_M
-from envs.cameras import Point, look_at
+from envs.cameras import Point
 from envs.deployment import Deployment, Meaning, Mount, Quantity
 from envs.grasp.robot.urdf import load_robot
-from envs.grasp.settings import Camera, GraspSettings, Workspace
+from envs.grasp.sensors.camera import nominal_pose
+from envs.grasp.settings import GraspSettings, Workspace
 
 RIM_POINTS = 32
 STEM_M = 0.08
@@ -22,7 +23,7 @@ def deployment(settings: GraspSettings) -> Deployment:
         is_place=True,
         outline=_cup(load_robot().cup_radius_m),
     )
-    mounts = {name: _mount(camera) for name, camera in settings.cameras.items()}
+    mounts = {name: Mount.of(*nominal_pose(camera)) for name, camera in settings.cameras.items()}
     return Deployment(meaning=meaning, mounts=mounts)
 
 
@@ -45,10 +46,3 @@ def _cup(radius_m: float) -> tuple[tuple[Point, ...], ...]:
     angles = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS)
     rim = tuple((0.0, radius_m * float(np.cos(a)), radius_m * float(np.sin(a))) for a in angles)
     return rim, ((0.0, 0.0, 0.0), (-STEM_M, 0.0, 0.0))
-
-
-def _mount(camera: Camera) -> Mount:
-    """Where a camera is when nothing is drawn."""
-    position_m = np.array(camera.position_m)
-    roll_rad = float(np.radians(camera.roll_deg))
-    return Mount.of(position_m, look_at(position_m, np.array(camera.target_m), roll_rad))

@@ -33,7 +33,7 @@ class RunningEpisodes:
         tools: where the robots are.
         progress: what has happened.
         views: where each camera stands, by its name.
-        images: each camera's latest observation (N, H, W, C), by its name.
+        images: each camera's latest observation (N, H, W, C) or (N, P, 4), by its name.
     """
 
     scenes: Scenes

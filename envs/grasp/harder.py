@@ -43,9 +43,9 @@ def harder(settings: GraspSettings) -> dict[str, GraspSettings]:
 
 
 def _cameras(settings: GraspSettings, changed: Callable[[Camera], dict[str, Any]]) -> GraspSettings:
-    """The same with something changed of the depth cameras."""
+    """The same with something changed of the cameras that measure depth."""
     cameras = {
-        name: camera.model_copy(update=changed(camera)) if camera.type == "depth" else camera
+        name: camera.model_copy(update=changed(camera)) if camera.type != "rgb" else camera
         for name, camera in settings.cameras.items()
     }
     return settings.model_copy(update={"cameras": cameras})

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage, RgbImage
 from envs.grasp.episode_state import RunningEpisodes
-from envs.grasp.sensors.camera import CameraPoses, pinhole, sampling
+from envs.grasp.sensors.camera import CameraPoses, image_space
+from envs.grasp.sensors.clouds import CloudCamera, cloud_camera
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.base import Simulator
 
@@ -25,20 +26,19 @@ DECIMETRES_PER_M = 10.0
 
 def observation_space(settings: GraspSettings) -> gymnasium.spaces.Dict:
     """The space of one environment's observations."""
-    spaces: dict[str, gymnasium.Space[Any]] = {}
-    for name, camera in settings.cameras.items():
-        sampled = sampling(camera)
-        shape = (sampled.height, sampled.width)
-        if camera.type == "depth":
-            spaces[name] = DepthImage(
-                *shape, camera.range_m, camera.encoding, pinhole(camera), sampled
-            )
-        else:
-            spaces[name] = RgbImage(*shape, sampled)
+    spaces: dict[str, gymnasium.Space[Any]] = {
+        name: CloudCamera(camera).space if camera.type == "points" else image_space(camera)
+        for name, camera in settings.cameras.items()
+    }
     if settings.privileged:
         size = POSES_AND_PROGRESS + (LIMITS if settings.privileged_limits else 0)
         spaces[PRIVILEGED] = Box(-np.inf, np.inf, (size,), np.float32)
     return gymnasium.spaces.Dict(spaces)
+
+
+def image_spaces(settings: GraspSettings) -> dict[str, DepthImage | RgbImage]:
+    """The spaces of the cameras' images, by their names: of clouds, those they are made of."""
+    return {name: image_space(camera) for name, camera in settings.cameras.items()}
 
 
 def take_images(
@@ -48,13 +48,13 @@ def take_images(
     spaces: Mapping[str, gymnasium.Space[Any]],
     rng: np.random.Generator,
 ) -> dict[str, NDArray[Any]]:
-    """Images (n, H, W, C) as cameras deliver them now, by their names.
+    """Images (n, H, W, C) as cameras' sensors deliver them now, by their names.
 
     Args:
         simulator: holds the worlds.
         indices: of the n worlds.
         views: the cameras.
-        spaces: of their images; a mapping or a space of spaces.
+        spaces: of their images; see `image_spaces`.
         rng: the source of the sensors' randomness.
     """
     images: dict[str, NDArray[Any]] = {}
@@ -66,6 +66,26 @@ def take_images(
         else:
             images[name] = simulator.render(indices, view)
     return images
+
+
+def observed(
+    images: Mapping[str, NDArray[Any]],
+    views: Mapping[str, CameraPoses],
+    rng: np.random.Generator,
+) -> dict[str, NDArray[Any]]:
+    """What is observed of n images each: themselves, or clouds (n, P, 4), by the cameras' names.
+
+    Args:
+        images: (n, H, W, C) as the sensors deliver them.
+        views: the cameras.
+        rng: the source of the clouds' randomness.
+    """
+    clouds = {
+        name: cloud_camera(view.camera).clouds(images[name], picture_seeds(rng, len(view)))
+        for name, view in views.items()
+        if view.camera.type == "points"
+    }
+    return {**images, **clouds}
 
 
 def picture_seeds(rng: np.random.Generator, count: int) -> NDArray[np.uint64]:

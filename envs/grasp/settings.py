@@ -46,10 +46,35 @@ def check_resolution(resolution_m: float) -> float:
 FieldOfView = Annotated[float, Field(gt=1.0, lt=170.0)]
 
 
+class Cloud(BaseModel, frozen=True, extra="forbid"):
+    """The points that are made of a depth image."""
+
+    points: int = Field(
+        512,
+        ge=1,
+        le=65536,
+        description="Points of a cloud; where fewer pixels are seen, the others are missing.",
+    )
+    frame: Literal["base", "camera"] = Field(
+        "base",
+        description="Frame of the points: the robot's base, by where the camera stands when "
+        "nothing is drawn (a robot knows no better), or the camera.",
+    )
+    choice: Literal["random", "farthest"] = Field(
+        "random",
+        description="Which of the pixels that are seen: any, or always the point that is farthest "
+        "from those before, which takes milliseconds a cloud.",
+    )
+
+
 class Camera(BaseModel, frozen=True, extra="forbid"):
     """A pinhole camera, sampled at pixel centres."""
 
-    type: Literal["depth", "rgb"] = Field(description="What the camera measures.")
+    type: Literal["depth", "rgb", "points"] = Field(
+        description="What the camera delivers: images of depths or colours, or points made of "
+        "depths."
+    )
+    cloud: Cloud = Field(Cloud(), description="Points only: how they are made of depths.")
     width: int = Field(80, ge=1, le=4096, description="Width of the sensor in pixels.")
     height: int = Field(80, ge=1, le=4096, description="Height of the sensor in pixels.")
     fov_deg: FieldOfView | tuple[FieldOfView, FieldOfView] = Field(
@@ -73,27 +98,30 @@ class Camera(BaseModel, frozen=True, extra="forbid"):
     )
     near_m: Range = Field((0.05, 0.10), description="Near clip plane, drawn at every reset.")
     far_m: Range = Field((2.5, 3.0), description="Far clip plane, drawn at every reset.")
-    range_m: Range = Field((0.4, 2.0), description="Depth only: the sensor's measuring range.")
+    range_m: Range = Field(
+        (0.4, 2.0), description="Depth and points: the sensor's measuring range."
+    )
     noise_sigma_m: float = Field(
         0.002,
         ge=0.0,
         le=MAX_NOISE_SIGMA_M,
-        description="Depth and sensor: gaussian only: sigma of the noise.",
+        description="Depth and points, with sensor: gaussian only: sigma of the noise.",
     )
     missing_fraction: Range = Field(
         (0.0, 0.0),
-        description="Depth only: probability of each pixel to be missing, drawn at every reset.",
+        description="Depth and points: probability of each pixel to be missing, drawn at every "
+        "reset.",
     )
     sensor: (
         Literal["gaussian", "structured_light"]
         | Annotated[Gaussian | StructuredLight, Field(discriminator="type")]
     ) = Field(
         Gaussian(),
-        description="Depth only: how the camera errs, `gaussian` or `structured_light`, by its "
-        "name alone or with settings beside its `type`.",
+        description="Depth and points: how the camera errs, `gaussian` or `structured_light`, by "
+        "its name alone or with settings beside its `type`.",
     )
     encoding: Literal["uint16", "uint8"] = Field(
-        "uint16", description="Depth only: uint16 millimetres, or uint8 over the range."
+        "uint16", description="Depth and points: uint16 millimetres, or uint8 over the range."
     )
 
     @field_validator("sensor")
@@ -133,6 +161,16 @@ class Camera(BaseModel, frozen=True, extra="forbid"):
             raise ValueError(
                 f"range_m reaches {self.range_m[1]} m, over uint16's 65.535 m: lower it, or use "
                 "encoding: uint8"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _has_pixels_for_the_points(self) -> Camera:
+        pixels = self.sampling.of_sensor(self.width, self.height)
+        if self.type == "points" and self.cloud.points > pixels.width * pixels.height:
+            raise ValueError(
+                f"cloud.points {self.cloud.points} of {pixels.width}x{pixels.height} pixels (width "
+                "x height): some would always be missing; lower it, or let the camera have more"
             )
         return self
 

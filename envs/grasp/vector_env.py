@@ -25,7 +25,9 @@ from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.harder import harder
 from envs.grasp.observations import (
     PRIVILEGED,
+    image_spaces,
     observation_space,
+    observed,
     privileged_state,
     take_images,
 )
@@ -53,9 +55,9 @@ OBSERVATIONS_HELD = 4
 class GraspVectorEnv(Environment):
     """N KUKA KR 16 with suction cups, each before its own blocks. See `Environment`.
 
-    Observations: one image for each camera by its name, (N, H, W, 1) depth or (N, H, W, 3) RGB, and
-    `privileged` (N, 22), or (N, 18) without limits, where the settings ask for it. Actions: (N, 4)
-    in [-1, 1], the tooltip's x, y, z and yaw over the workspace.
+    Observations: one for each camera by its name, (N, H, W, 1) depth, (N, H, W, 3) RGB or (N, P, 4)
+    points, and `privileged` (N, 22), or (N, 18) without limits, where the settings ask for it.
+    Actions: (N, 4) in [-1, 1], the tooltip's x, y, z and yaw over the workspace.
 
     Args:
         settings: the task.
@@ -90,6 +92,7 @@ class GraspVectorEnv(Environment):
         self.num_envs = settings.num_envs
         self.single_action_space = Box(-1.0, 1.0, (4,), np.float32)
         self.single_observation_space = observation_space(settings)
+        self._image_spaces = image_spaces(settings)
         self.privileged = frozenset({PRIVILEGED}) & self.single_observation_space.keys()
         per_env = OBSERVATIONS_HELD * space_bytes(self.single_observation_space)
         if lack := shortage(self.num_envs * per_env):
@@ -298,9 +301,9 @@ class GraspVectorEnv(Environment):
     def _pictures(
         self, indices: NDArray[np.int64], views: Mapping[str, CameraPoses]
     ) -> dict[str, NDArray[Any]]:
-        """Images (n, H, W, C) of each camera now in some worlds, by its name."""
-        spaces = self.single_observation_space
-        return take_images(self._simulator, indices, views, spaces, self._rng)
+        """What each camera observes now in some worlds, by its name."""
+        images = take_images(self._simulator, indices, views, self._image_spaces, self._rng)
+        return observed(images, views, self._rng)
 
     def _observations(self) -> ObservationArrays:
         episodes = self._running()

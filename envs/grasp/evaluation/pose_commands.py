@@ -25,7 +25,7 @@ class PoseCommands:
         tooltip_m: (n, 3) where the centre of the cup's face is sent, world frame.
         yaw_rad: (n,) the tool's yaw there.
         views: where each camera stands, by its name.
-        images: each camera's observation (n, H, W, C), by its name.
+        images: each camera's observation (n, H, W, C) or (n, P, 4), by its name.
     """
 
     scenes: Scenes

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.evaluation.pose_errors import PoseErrors, Sample
 from envs.grasp.robot.arm import Arm
+from envs.grasp.sensors.clouds import cloud_camera
 from envs.grasp.settings import GraspSettings
 from envs.grasp.task import GoalRegion, block_offset, yaw_error
 
@@ -49,7 +50,7 @@ class GraspReport:
             )
         self._settings, self._arm, self._pose_commands = settings, arm, commands
         cameras = settings.cameras
-        depth = [name for name, camera in cameras.items() if camera.type == "depth"]
+        depth = [name for name, camera in cameras.items() if camera.type != "rgb"]
         self._camera = (depth or list(cameras))[0]
         self._errors: list[PoseErrors] = []
         self._samples: list[Sample] = []
@@ -80,10 +81,12 @@ class GraspReport:
         yield moving, film(self._samples[:FILMED], self._settings, self._arm, self._picked)
 
     def _sample(self, commands: PoseCommands, errors: PoseErrors, row: slice) -> Sample:
+        view, image = commands.views[self._camera][row], commands.images[self._camera][row][0]
+        is_cloud = view.camera.type == "points"
         return Sample(
             scene=commands.scenes[row],
-            view=commands.views[self._camera][row],
-            image=commands.images[self._camera][row][0],
+            view=view,
+            image=cloud_camera(view.camera).image(image) if is_cloud else image,
             tooltip_m=commands.tooltip_m[row][0],
             yaw_rad=float(commands.yaw_rad[row][0]),
             errors=errors[row],

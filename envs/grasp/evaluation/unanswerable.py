@@ -15,8 +15,8 @@ from encoders.cameras import Pinhole
 from encoders.spaces import DepthImage
 from envs.evaluation import Unanswerable
 from envs.grasp.observations import (
-    PRIVILEGED,
-    observation_space,
+    image_spaces,
+    observed,
     picture_seeds,
     take_images,
 )
@@ -60,7 +60,19 @@ def unanswerable(
     rng = np.random.default_rng(seed)
     whole_yaw = np.full(count, np.radians(parameter_ranges(settings)[YAW_LIMIT].high))
     scenes, views = SceneSampler(settings).sample(rng, whole_yaw)
-    spaces = {k: v for k, v in observation_space(settings).items() if k != PRIVILEGED}
+    for one in _images(settings, robot, rng, scenes, views):
+        yield replace(one, observations=observed(one.observations, views, rng))
+
+
+def _images(
+    settings: GraspSettings,
+    robot: Robot,
+    rng: np.random.Generator,
+    scenes: Scenes,
+    views: Mapping[str, CameraPoses],
+) -> Iterator[Unanswerable]:
+    """The same as the sensors' images."""
+    count, spaces = len(scenes), image_spaces(settings)
     drawn = partial(_drawn, rng, views, spaces)
     with closing(make_simulator(settings, robot, count)) as simulator:
         take = partial(_taken, rng, views, spaces, simulator, Arm.of(settings, robot))

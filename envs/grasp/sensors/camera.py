@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from encoders.cameras import Pinhole, Sampling
+from encoders.spaces import DepthImage, RgbImage
 from envs.cameras import euler_rotations, look_at
 from envs.grasp.batch import Batch
 from envs.grasp.sensors.structured_light import StructuredLight
@@ -90,6 +91,23 @@ def pinhole(camera: Camera) -> Pinhole:
     return sampling(camera).pinhole(sensor_pinhole(camera))
 
 
+def image_space(camera: Camera) -> DepthImage | RgbImage:
+    """The images that a camera's sensor delivers."""
+    taken = sampling(camera)
+    if camera.type == "rgb":
+        return RgbImage(taken.height, taken.width, taken)
+    return DepthImage(
+        taken.height, taken.width, camera.range_m, camera.encoding, pinhole(camera), taken
+    )
+
+
+def nominal_pose(camera: Camera) -> tuple[Floats, Floats]:
+    """Where a camera stands when nothing is drawn: its centre (3,) and axes (3, 3) as columns."""
+    position_m = np.array(camera.position_m)
+    roll_rad = float(np.radians(camera.roll_deg))
+    return position_m, look_at(position_m, np.array(camera.target_m), roll_rad)
+
+
 def _focal_length_px(pixels: int, fov_deg: float) -> float:
     return pixels / 2.0 / float(np.tan(np.radians(fov_deg) / 2.0))
 
@@ -101,8 +119,7 @@ def sample_views(
 
     A structured-light camera's faults are drawn, too; nothing in view is dark.
     """
-    nominal = np.array(camera.position_m)
-    nominal_rotation = look_at(nominal, np.array(camera.target_m), np.radians(camera.roll_deg))
+    nominal, nominal_rotation = nominal_pose(camera)
     jitter = np.radians(rng.uniform(-rotation_deg, rotation_deg, (n, 3)))
     views = CameraPoses(
         camera,

@@ -17,9 +17,10 @@ from curricula.samplers import (
     UniformSampler,
 )
 from encoders.cameras import Pinhole, Sampling
-from encoders.spaces import DepthImage, RgbImage
+from encoders.spaces import DepthImage, PointCloud, RgbImage
 from envs.grasp.scene.sampler import heading
-from envs.grasp.settings import Camera, GraspSettings
+from envs.grasp.sensors.clouds import CloudCamera
+from envs.grasp.settings import Camera, Cloud, GraspSettings, Randomize
 from envs.grasp.simulators.pybullet import PyBulletSimulator
 from envs.grasp.vector_env import GraspVectorEnv
 from rewards.plugin import ventosa_rewards
@@ -28,7 +29,8 @@ from trainers.saving.serialization import flatten, unflatten
 
 SHAPED = ("touch", "collision", "position", "rotation", "approach", "facing")
 SMALL = {"depth": Camera(type="depth", width=32, height=24)}
-BOTH = {**SMALL, "above": Camera(type="rgb", width=20, height=30, fov_deg=50)}
+POINTS = Camera(type="points", width=32, height=24, cloud=Cloud(points=50))
+ALL = {**SMALL, "above": Camera(type="rgb", width=20, height=30, fov_deg=50), "cloud": POINTS}
 MODES = pytest.mark.parametrize("frame_grab", [True, False], ids=["frame_grab", "stream"])
 MakeEnv = Callable[..., GraspVectorEnv]
 
@@ -125,7 +127,7 @@ def test_more_pixels_than_the_machine_holds_are_refused_at_once() -> None:
 
 @MODES
 def test_spaces_contain_what_is_delivered(make: MakeEnv, frame_grab: bool) -> None:
-    env = make(5, frame_grab=frame_grab, cameras=BOTH, privileged=True, episode_steps=2)
+    env = make(5, frame_grab=frame_grab, cameras=ALL, privileged=True, episode_steps=2)
     assert isinstance(env, VectorEnv)
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     spaces = env.single_observation_space.spaces
@@ -133,11 +135,13 @@ def test_spaces_contain_what_is_delivered(make: MakeEnv, frame_grab: bool) -> No
     camera = Pinhole(focal_length_px, focal_length_px, 16.0, 12.0)
     assert spaces["depth"] == DepthImage(24, 32, pinhole=camera)
     assert isinstance(spaces["above"], RgbImage)
+    assert isinstance(spaces["cloud"], PointCloud)
     assert env.single_action_space == gymnasium.spaces.Box(-1, 1, (4,), np.float32)
     assert env.action_space.shape == (5, 4)
     observations, infos = env.reset(seed=0)
     assert infos == {}
-    shapes = {"depth": (5, 24, 32, 1), "above": (5, 30, 20, 3), "privileged": (5, 22)}
+    shapes = {"depth": (5, 24, 32, 1), "above": (5, 30, 20, 3), "cloud": (5, 50, 4)}
+    shapes["privileged"] = (5, 22)
     for step in range(5):
         assert {name: value.shape for name, value in observations.items()} == shapes
         assert env.observation_space.contains(observations), step
@@ -426,6 +430,35 @@ def test_the_stream_takes_a_picture_at_every_step(make: MakeEnv, pictures: list[
         assert (observations["depth"] != before["depth"]).any((1, 2, 3)).all()
 
 
+@pytest.mark.parametrize("simulator", ["fast", "pybullet"])
+def test_points_lie_where_things_are(make: MakeEnv, simulator: str) -> None:
+    exact = POINTS.model_copy(update={"noise_sigma_m": 0.0})
+    still_cameras = Randomize(camera_position_m=0.0, camera_rotation_deg=0.0)
+    env = make(4, simulator=simulator, cameras={"cloud": exact}, randomize=still_cameras)
+    observations, _ = env.reset(seed=0)
+    for cloud, target_m in zip(observations["cloud"], env.scenes.target_m, strict=True):
+        points = cloud[cloud[:, 3] > 0, :3]
+        on_table = points[np.abs(points[:, 2] - 0.6) < 0.003]
+        assert 5 < len(on_table) < len(points)
+        assert points[:, 2].min() > 0.54  # the table's front, 5 cm thick
+        assert np.linalg.norm(points - target_m, axis=1).min() < 0.1
+
+
+@pytest.mark.parametrize("sensor", ["gaussian", "structured_light"])
+def test_points_do_not_tell_where_the_camera_really_is(make: MakeEnv, sensor: str) -> None:
+    camera = Camera(type="points", width=32, height=24, cloud=Cloud(points=200), sensor=sensor)
+    moved = Randomize(camera_position_m=0.05, camera_rotation_deg=5.0)
+    env = make(4, simulator="fast", cameras={"cloud": camera}, randomize=moved)
+    observations, _ = env.reset(seed=0)
+    nominal = CloudCamera(camera)
+    for cloud in observations["cloud"]:
+        # Each is on the ray of a pixel of the camera as it is thought to be, at a whole millimetre.
+        image = nominal.image(cloud)
+        points = nominal.clouds(image[None], np.zeros(1, np.uint64))[0]
+        order, expected = (np.lexsort(some.T) for some in (points, cloud))
+        np.testing.assert_allclose(points[order], cloud[expected], atol=1e-6)
+
+
 def test_the_stream_shows_the_robot(make: MakeEnv) -> None:
     env = make(4, frame_grab=False)
     first, _ = env.reset(seed=0)
@@ -441,7 +474,7 @@ def test_the_stream_shows_the_robot(make: MakeEnv) -> None:
 def test_observations_handed_out_are_never_written_to_again(
     make: MakeEnv, frame_grab: bool
 ) -> None:
-    env = make(4, frame_grab=frame_grab, cameras=BOTH, privileged=True, episode_steps=3)
+    env = make(4, frame_grab=frame_grab, cameras=ALL, privileged=True, episode_steps=3)
     observations, _ = env.reset(seed=0)
     handed = [(observations, {name: value.copy() for name, value in observations.items()})]
     for _, _, _, _, infos in [result := env.step(still(env)) for _ in range(7)]:
@@ -646,7 +679,7 @@ def test_unknown_parameters_are_named(make: MakeEnv) -> None:
 def test_same_seed_same_rollout_other_seed_another(make: MakeEnv, frame_grab: bool) -> None:
     results = []
     for construction, seed in ((0, 7), (1, 7), (0, 8)):
-        env = make(4, seed=construction, frame_grab=frame_grab, cameras=BOTH, privileged=True)
+        env = make(4, seed=construction, frame_grab=frame_grab, cameras=ALL, privileged=True)
         results.append([env.reset(seed=seed), *play(env, 8, 0)])
     same(results[0], results[1])
     first, other = (result[0][0] for result in (results[0], results[2]))
@@ -665,7 +698,7 @@ def test_the_constructors_seed_counts_until_a_reset_gives_one(make: MakeEnv) -> 
 def test_an_episode_does_not_depend_on_the_workers(make: MakeEnv) -> None:
     results = []
     for workers in (0, 2):
-        env = make(5, workers=workers, cameras=BOTH, frame_grab=False)
+        env = make(5, workers=workers, cameras=ALL, frame_grab=False)
         results.append([env.reset(seed=3), *play(env, 5, 1)])
     same(results[0], results[1])
 
@@ -674,7 +707,7 @@ def test_an_episode_does_not_depend_on_the_workers(make: MakeEnv) -> None:
 def test_a_saved_state_has_the_same_future_bit_for_bit(make: MakeEnv, frame_grab: bool) -> None:
     options = {
         "frame_grab": frame_grab,
-        "cameras": BOTH,
+        "cameras": ALL,
         "privileged": True,
         "episode_steps": 4,
     }

@@ -19,6 +19,7 @@ TASKS = {
     "structured light": GraspSettings(
         cameras={"eye": LIGHT}, randomize=Randomize(surroundings=Surroundings())
     ),
+    "points": GraspSettings(cameras={"eye": DEPTH.model_copy(update={"type": "points"})}),
 }
 
 
@@ -72,6 +73,8 @@ def test_one_thing_is_harder_in_each() -> None:
         "more blocks": {"blocks"},
     }
     assert {what: changed(task, other) for what, other in harder(task).items()} == expected
+    points = TASKS["points"]
+    assert {what: changed(points, other) for what, other in harder(points).items()} == expected
     assert harder(task)["twice the noise"].cameras["eye"].noise_sigma_m == pytest.approx(0.006)
 
 

@@ -100,6 +100,20 @@ def test_the_film_goes_on_to_the_pick_only_where_there_is_one(env: GraspVectorEn
     assert lengths_ms[1] - lengths_ms[0] > 2000
 
 
+def test_a_cloud_is_drawn_as_the_image_of_its_points() -> None:
+    made = make_vector_env(2, simulator="fast", cameras={"eye": Camera(type="points")})
+    try:
+        observations, _ = made.reset(seed=0)
+        report = made.evaluator().pictures()
+        report.add(np.zeros((2, 4)), {})
+        for sample, cloud in zip(report._samples, observations["eye"], strict=True):
+            assert sample.image.shape == (80, 80, 1)
+            assert np.count_nonzero(sample.image) == cloud[:, 3].sum() == 512
+        contact_sheet(report._samples, 0.03)
+    finally:
+        made.close()
+
+
 def test_the_cup_is_drawn_where_the_camera_would_see_it(
     env: GraspVectorEnv, monkeypatch: pytest.MonkeyPatch
 ) -> None:

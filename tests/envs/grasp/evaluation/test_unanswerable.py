@@ -13,7 +13,8 @@ from envs.cameras import look_at
 from envs.evaluation import Unanswerable
 from envs.grasp.evaluation.unanswerable import unanswerable
 from envs.grasp.robot.urdf import load_robot
-from envs.grasp.settings import Camera, GraspSettings, Randomize, Surroundings
+from envs.grasp.sensors.clouds import CloudCamera
+from envs.grasp.settings import Camera, Cloud, GraspSettings, Randomize, Surroundings
 from envs.grasp.vector_env import GraspVectorEnv
 from trainers.inference.policy import Policy
 
@@ -144,6 +145,20 @@ def test_colours_and_surroundings_are_shown() -> None:
     wall = Surroundings(wall=1.0, rack=0.0, things=(2, 2))
     around = kinds(settings_of(surroundings=wall))["no block"].observations["eye"]
     assert (around > 0).mean() > (kinds(settings_of())["no block"].observations["eye"] > 0).mean()
+
+
+def test_clouds_are_made_of_the_same_images(images: dict[str, np.ndarray]) -> None:
+    cloud = Cloud(points=40 * 48, frame="camera")
+    camera = CAMERA.model_copy(update={"type": "points", "cloud": cloud})
+    maker = CloudCamera(camera)
+    found = kinds(settings_of(camera))
+    assert found.keys() == images.keys()
+    # What is drawn for clouds comes in between, so that only the first ones are the very same.
+    first = [maker.image(row) for row in found["no block"].observations["eye"]]
+    np.testing.assert_array_equal(np.stack(first), images["no block"])
+    for one in found.values():
+        assert maker.space.contains(one.observations["eye"][0]), one.kind
+    assert not found["nothing seen"].observations["eye"].any()
 
 
 @pytest.mark.parametrize("folder", POLICIES, ids=lambda folder: folder.name)
