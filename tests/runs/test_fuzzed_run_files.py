@@ -17,7 +17,8 @@ from typing import Any
 
 import pytest
 
-from trainers.learn import DONE, FAILED, MISTAKE, TERMINATED, main
+from trainers.common.command import DONE, FAILED, MISTAKE, TERMINATED
+from trainers.learn import main
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import load_run, resolved
 from trainers.runfile.yaml_document import dump

@@ -21,10 +21,10 @@ from safetensors.torch import load_file, save_file
 
 from envs.environment import EnvironmentFailure
 from trainers import calibrate, compare, evaluate, export, learn, predict
+from trainers.common.command import DONE, MISTAKE
 from trainers.common.errors import UserError
 from trainers.comparison.results import read_status
 from trainers.inference.policy import Policy
-from trainers.learn import DONE, MISTAKE
 from trainers.run import run_file
 from trainers.saving.checkpoint import MANIFEST, STATE, WEIGHTS, Checkpoints
 
