@@ -11,8 +11,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
+import safetensors.torch
 from torch.utils.tensorboard import SummaryWriter
 
 from trainers import evaluate
@@ -170,6 +172,27 @@ def test_a_log_that_can_not_be_written_is_told_once_and_the_run_goes_on(
     assert (done.code, done.step) == (0, 64)
     assert read_status(done.results / "toy")["state"] == "finished"
     assert sum("the log can't be written" in message for message in caplog.messages) == 1
+
+
+def test_a_full_disk_ends_a_run_in_a_line_with_the_checkpoint_that_is_left(
+    learn: Learn, write_run: WriteRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = OSError(28, "No space left on device")
+    save_file = safetensors.torch.save_file
+    results = iter([save_file])  # the disk has room for one
+
+    def save(*arguments: Any) -> None:
+        next(results, Mock(side_effect=full))(*arguments)
+
+    monkeypatch.setattr(safetensors.torch, "save_file", save)
+    done = learn(write_run())
+    folder = done.results / "toy/checkpoints"
+    told = f"{folder / 'step-64'}: cannot write: No space left on device"
+    left = f"the last good checkpoint is {folder / 'step-32'}"
+    assert (done.code, done.errors) == (1, f"error: {told}; {left}\n")
+    status = read_status(done.results / "toy")
+    assert (status["state"], status["reason"]) == ("failed", f"{told}; {left}")
+    assert [path.name for path in done.checkpoints] == ["step-32"]
 
 
 def until(condition: Callable[[], bool]) -> None:

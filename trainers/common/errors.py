@@ -19,6 +19,14 @@ class Failure(Exception):  # noqa: N818 - Error would say that something is wron
     """
 
 
+class UnwritableError(Failure, OSError):
+    """A file can't be written, on a full or a read-only disk for instance: `filename` is which."""
+
+    def __str__(self) -> str:
+        """Which and why."""
+        return f"{self.filename}: {self.strerror}"
+
+
 class NonFiniteError(Failure):
     """NaN or infinity where learning can't go on; the message names what, where and when."""
 

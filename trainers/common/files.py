@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from trainers.common.errors import UnwritableError
+
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
@@ -18,13 +20,13 @@ def naming(path: Path) -> Iterator[None]:
     one that means nothing to the user.
 
     Raises:
-        OSError: of the same kind as the original one, with `path` as its file name.
+        UnwritableError: with `path` as its file name.
     """
     try:
         yield
     except OSError as error:
         reason = f"cannot write: {error.strerror or error}"
-        raise OSError(error.errno, reason, str(path)) from error
+        raise UnwritableError(error.errno, reason, str(path)) from error
 
 
 def sync(path: Path) -> None:
@@ -60,7 +62,7 @@ def write_atomically(path: Path, data: bytes | str) -> None:
         data: the whole content; text is written as UTF-8.
 
     Raises:
-        OSError: naming `path`; what was there before is untouched.
+        UnwritableError: what was there before is untouched.
     """
     content = data.encode() if isinstance(data, str) else data
     # Always the same name: what an interrupted write left behind is overwritten by the next one.
