@@ -14,6 +14,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from trainers.common.averager import Averager
+from trainers.common.errors import UnwritableError
 from trainers.reporting.event_log import RunLog
 
 TAG = "Environment/Cumulative Reward"
@@ -147,7 +148,7 @@ def test_a_failed_status_leaves_the_old_one(
 
 def test_a_place_that_is_no_directory_is_an_error_naming_it(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(NotADirectoryError) as caught:
+    with pytest.raises(UnwritableError) as caught:
         RunLog(tmp_path / "file" / "run")
     assert caught.value.filename == str(tmp_path / "file" / "run")
 
