@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -20,7 +20,7 @@ from torch.utils.tensorboard import SummaryWriter
 from trainers import evaluate
 from trainers import run as run_module
 from trainers.algorithms.ppo import PPO
-from trainers.comparison.results import read_status
+from trainers.comparison.results import STATUS, read_status
 from trainers.experience.env_runner import EnvRunner
 from trainers.learn import main
 from trainers.runfile.registry import load_registries
@@ -57,6 +57,19 @@ class Breaking:
 def ventosa_rewards():
     return {"breaks": Breaking}
 """
+
+
+@pytest.fixture(autouse=True)
+def _not_under_nohup() -> Iterator[None]:
+    """There runs ignore SIGHUP, as they should."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+def last_checkpoint(done: Any) -> str:
+    """What the status of a run says that it left."""
+    return str(json.loads((done.results / "toy" / STATUS).read_text())["last_checkpoint"])
 
 
 def at_call(
@@ -105,7 +118,7 @@ def test_a_plugin_that_fails_is_named_with_its_lines_and_leaves_the_run_saved(
     assert "Traceback" not in done.errors
     status = read_status(done.results / "toy")
     assert (status["state"], f"error: {status['reason']}") == ("failed", said)
-    assert status["last_checkpoint"] == str(saved)
+    assert last_checkpoint(done) == str(saved)
     assert evaluate.main(["toy", "--results-dir", str(done.results)]) == 1
     assert capfd.readouterr().err.startswith(f"error: {failed}\n")
 
