@@ -13,7 +13,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from encoders.image_files import read_image
 from encoders.raw_inputs import RawInput
 from envs.deployment import Meaning
 from envs.drawing import annotated
@@ -25,6 +24,7 @@ from trainers.evaluate import add_trust_option
 from trainers.evaluation import find_run
 from trainers.inference.confidence import Card
 from trainers.inference.fitting import load_raw_policy
+from trainers.inference.image_files import read_image
 from trainers.inference.onnx_policy import OnnxPolicy, is_onnx
 from trainers.inference.raw_policy import (
     ACTION,
