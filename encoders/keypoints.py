@@ -14,6 +14,7 @@ from encoders.inputs import fill_gaps
 from encoders.layers import Size, dense
 from encoders.points import (
     ATTENTION_GAIN,
+    COORDINATES,
     MOMENTS,
     UNSEEN,
     PointEncoder,
@@ -23,7 +24,6 @@ from encoders.points import (
     patches,
     second_moments,
 )
-from encoders.spaces import COORDINATES
 
 
 class Keypoints(PointEncoder):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from encoders.conv import Conv, Paper
 from encoders.keypoints import Keypoints
 from encoders.ml_agents import FullyConnected, NatureCnn, ResNet, Simple
-from encoders.points import PointNet
+from encoders.pointnet import PointNet
 from encoders.second_look import SecondLook
 from encoders.vector import Vector
 from trainers.hookspecs import hookimpl

@@ -1,22 +1,19 @@
-"""Points: what encoders of depth images make of them, and the encoder ``pointnet`` of clouds."""
+"""What the encoders of points share: patches of depths, and moments of the points attended to."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager, nullcontext
-from typing import Annotated
 
 import numpy as np
 import torch
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field
 from torch import nn
 from torch.nn import functional as F
 
-from encoders.layers import Size, dense
-from encoders.spaces import COORDINATES, DepthImage, PointCloud
+from encoders.spaces import DepthImage
 
 # Coordinates are decimetres, so that the size of a block is near 1.
 UNITS_PER_M = 10.0
@@ -24,8 +21,8 @@ PLACE_SCALE = 1.0 / 3.0
 LARGEST_COVARIANCE = 3.0
 # Sharp enough at the start that no two keypoints are the mean of all points.
 ATTENTION_GAIN = 4.0
-CLOUDS_AT_ONCE = 8  # what so many are described by stays in a processor's cache
 UNSEEN = -1e4  # the logit of what the camera does not see
+COORDINATES = 3
 MOMENTS = 6
 
 
@@ -83,70 +80,6 @@ class PointEncoder(nn.Module, ABC):
         points = depth_m[..., None] * self.rays
         points[..., 2] -= self._middle_m
         return points.mul_(UNITS_PER_M).flatten(1, 2)
-
-
-class PointNet(nn.Module):
-    """Encoder ``pointnet``: the same layers for every point, then the maximum over all points.
-
-    After Qi et al. 2017 (arXiv:1612.00593), without its learned transformations: each layer ends in
-    a ReLU, and each feature is that of the point which has most of it. So neither the order of the
-    points nor the number of rows without one makes a difference.
-
-    Attributes:
-        features_dim: Units of the last of the layers.
-
-    Raises:
-        ValueError: The space holds no point clouds.
-    """
-
-    class Settings(BaseModel, frozen=True, extra="forbid"):
-        """Settings of the encoder ``pointnet``."""
-
-        layers: Annotated[
-            tuple[Size, ...],
-            Field(
-                min_length=1,
-                description="Units of the layers that all points share; the last are the features.",
-            ),
-        ] = (32, 64, 128)
-
-    def __init__(self, space: Box, settings: Settings) -> None:
-        super().__init__()
-        if not isinstance(space, PointCloud):
-            raise ValueError(
-                "the encoder 'pointnet' takes point clouds (encoders.spaces.PointCloud), such as a "
-                f"camera of `type: points` delivers, and not {space}: use 'keypoints' or 'conv' "
-                "for images, 'vector' for vectors"
-            )
-        self._middle_m: torch.Tensor
-        self.register_buffer("_middle_m", torch.tensor(space.middle_m), persistent=False)
-        self.layers = nn.Sequential()
-        width = COORDINATES
-        for units in settings.layers:
-            self.layers.append(dense(width, units, "relu"))
-            width = units
-        self.features_dim = width
-
-    def forward(self, raw: torch.Tensor) -> torch.Tensor:
-        """Clouds (B, P, 4) -> features (B, features_dim) float32; 0 where there is no point."""
-        if torch.compiler.is_exporting() or raw.shape[1] <= self.features_dim:
-            return self._describe(raw).amax(dim=1)
-        with torch.no_grad():
-            largest = [self._describe(part).max(dim=1) for part in raw.split(CLOUDS_AT_ONCE)]
-        if not torch.is_grad_enabled():
-            return torch.cat([part.values for part in largest])
-        # The gradient of a maximum is that of one point: only those are described again, which
-        # takes a fifth of the time.
-        rows = torch.cat([part.indices for part in largest])[..., None].expand(-1, -1, raw.shape[2])
-        return self._describe(raw.gather(1, rows)).diagonal(dim1=1, dim2=2)
-
-    def _describe(self, raw: torch.Tensor) -> torch.Tensor:
-        """Rows (B, n, 4) -> features of each (B, n, features_dim)."""
-        points = (raw[..., :COORDINATES] - self._middle_m) * UNITS_PER_M
-        missing = raw[..., COORDINATES:] < 0.5
-        # Features are 0 or more: one of 0 is never the largest, unless there is nothing else.
-        described: torch.Tensor = self.layers(points)
-        return described.masked_fill(missing, 0.0)
 
 
 def known_camera(space: Box) -> DepthImage:

@@ -14,6 +14,7 @@ from encoders.inputs import nearest_surfaces
 from encoders.layers import Size, dense
 from encoders.points import (
     ATTENTION_GAIN,
+    COORDINATES,
     MOMENTS,
     UNSEEN,
     PointEncoder,
@@ -23,7 +24,7 @@ from encoders.points import (
     patches,
     second_moments,
 )
-from encoders.spaces import COORDINATES, DepthImage
+from encoders.spaces import DepthImage
 
 # What is known of a cell: depth, coverage, how much of it is missing.
 CHANNELS = 3

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from encoders.cameras import Pinhole
-from encoders.points import PointNet
+from encoders.pointnet import PointNet
 from encoders.spaces import DepthImage, PointCloud, RgbImage
 
 MIDDLE_M = (1.0, 0.0, 0.8)

@@ -18,7 +18,7 @@ from encoders.cameras import Pinhole, Sampling
 from encoders.conv import Conv, Paper
 from encoders.keypoints import Keypoints
 from encoders.ml_agents import FullyConnected, NatureCnn, ResNet, Simple
-from encoders.points import PointNet
+from encoders.pointnet import PointNet
 from encoders.second_look import SecondLook
 from encoders.spaces import DepthImage, PointCloud, RgbImage
 from encoders.vector import Vector
