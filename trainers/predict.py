@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from encoders.raw_inputs import RawInput
 from envs.deployment import Meaning
 from envs.drawing import annotated
+from envs.image_files import read_image
 from envs.views import View
 from trainers.common.command import DONE, tells_failures
 from trainers.common.errors import UserError
@@ -24,7 +25,6 @@ from trainers.evaluate import add_trust_option
 from trainers.evaluation import find_run
 from trainers.inference.confidence import Card
 from trainers.inference.fitting import load_raw_policy
-from trainers.inference.image_files import read_image
 from trainers.inference.onnx_policy import OnnxPolicy, is_onnx
 from trainers.inference.raw_policy import (
     ACTION,

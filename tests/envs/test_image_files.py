@@ -12,7 +12,7 @@ import pytest
 from encoders.cameras import Sampling
 from encoders.raw_inputs import raw_input
 from encoders.spaces import DepthImage, RgbImage
-from trainers.inference.image_files import read_image
+from envs.image_files import read_image
 
 TAKEN = Sampling(12, 10, 2, 1, 3, 2, 4)
 DEPTH = raw_input(DepthImage(2, 3, (0.4, 2.0), sampling=TAKEN))
