@@ -175,7 +175,8 @@ class GymEnvironment(Environment):
         begun, lengths, actions = state["begun"], state["lengths"], state["actions"]
         if not begun.shape == lengths.shape == actions.shape[1:2] == (self.num_envs,):
             raise ValueError(f"it was saved with {len(begun)} environments, not {self.num_envs}")
-        if begun.min() < 1 or lengths.min() < 0 or lengths.max() > len(actions):
+        longest = lengths.max(initial=0, where=lengths <= LONGEST_REPLAY_STEPS)
+        if begun.min() < 1 or lengths.min() < 0 or longest > len(actions):
             raise ValueError(
                 f"episodes {begun} of {lengths} steps, where {len(actions)} have actions"
             )

@@ -253,10 +253,10 @@ class _Reader:
 
     def check_extent(self, root: yaml.Node) -> None:
         """Refuse what would grow without bound if its aliases were written out; none is here."""
-        values, depth = _extent(root, {})
+        values, levels = _extent(root, {})
         if values > MOST_VALUES:
             message = f"has over {MOST_VALUES} values, aliases written out: too many for a run file"
-        elif depth > DEEPEST:
+        elif levels > DEEPEST:
             message = f"is nested over {DEEPEST} deep, aliases written out: too deep for a run file"
         else:
             return
@@ -321,7 +321,7 @@ class _Reader:
 
 
 def _extent(node: yaml.Node, known: dict[int, tuple[int, int]]) -> tuple[int, int]:
-    """Values and depth of a node with its aliases written out; each node is looked at once.
+    """Values and levels of a node with its aliases written out; each node is looked at once.
 
     Raises:
         RecursionError: an alias contains itself.
@@ -331,8 +331,8 @@ def _extent(node: yaml.Node, known: dict[int, tuple[int, int]]) -> tuple[int, in
     if id(node) not in known:
         is_mapping = isinstance(node, yaml.MappingNode)
         parts = itertools.chain(*node.value) if is_mapping else node.value
-        values, depths = zip((1, 0), *(_extent(part, known) for part in parts), strict=True)
-        known[id(node)] = sum(values), 1 + max(depths)
+        values, levels = zip((1, 0), *(_extent(part, known) for part in parts), strict=True)
+        known[id(node)] = sum(values), 1 + max(levels)
     return known[id(node)]
 
 

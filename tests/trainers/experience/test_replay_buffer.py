@@ -352,7 +352,9 @@ def test_a_state_is_no_copy() -> None:
 
 
 def test_a_buffer_larger_than_any_memory_is_the_users_mistake() -> None:
-    with pytest.raises(UserError, match=r"buffer_size: there is no room for 10{13} .*lower it$"):
+    with pytest.raises(
+        UserError, match=r"buffer_size: to keep 10(,0{3}){4} transitions needs .* GB, .* lower it$"
+    ):
         ReplayBuffer(LINE, 1, 1, 10**13, CPU)
 
 
