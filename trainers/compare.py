@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from trainers.common.command import DONE, FAILED, tells_failures
+from trainers.common.command import DONE, FAILED, require_extra, tells_failures
 from trainers.common.errors import UserError
 from trainers.comparison.jobs import CORES, Job, run_missing
 from trainers.comparison.report import Experiments, write_report
@@ -67,7 +66,7 @@ class PlannedRun:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs what is missing and reports on all; returns the exit code."""
     options = parse_options(arguments)
-    _require_matplotlib()
+    require_extra("render", "matplotlib")
     made = [path for path in options.paths if (path / CONFIGURATION).is_file()]
     planned = list(plan(options, [path for path in options.paths if path not in made]))
     registries = load_registries()
@@ -110,11 +109,6 @@ def positive(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"should be a whole number from 1, not {text!r}")
     return int(text)
-
-
-def _require_matplotlib() -> None:
-    if importlib.util.find_spec("matplotlib") is None:
-        raise UserError("matplotlib is not installed: pip install 'ventosa[render]'")
 
 
 def plan(options: argparse.Namespace, paths: Sequence[Path]) -> Iterator[PlannedRun]:

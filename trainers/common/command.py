@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 import sys
 from collections.abc import Callable
 from typing import ParamSpec
@@ -39,6 +40,17 @@ def tells_failures(main: Callable[P, int]) -> Callable[P, int]:
                 return MISTAKE if isinstance(error, UserError) else FAILED
 
     return command
+
+
+def require_extra(extra: str, *packages: str) -> None:
+    """Refuses to begin without packages of one of ventosa's extras.
+
+    Raises:
+        UserError: names one that is missing, and the command that installs it.
+    """
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            raise UserError(f"{package} is not installed: pip install 'ventosa[{extra}]'")
 
 
 def told(error: BaseException) -> str:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from trainers.common.command import DONE, FAILED, tells_failures
+from trainers.common.command import DONE, FAILED, require_extra, tells_failures
 from trainers.common.errors import UserError
 from trainers.compare import positive
 from trainers.comparison.jobs import CORES
@@ -21,7 +20,7 @@ JOURNAL = "study.journal"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the trials that are missing and reports on all; returns the exit code."""
     options = parse_options(arguments)
-    _require("optuna", "matplotlib")
+    require_extra("sweep", "optuna", "matplotlib")
     try:
         with stop_on_signals() as stop:
             return _sweep(options, stop)
@@ -48,12 +47,6 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--results-dir", type=Path, default=Path("results/sweeps"), help="where sweeps are kept"
     )
     return parser.parse_args(arguments)
-
-
-def _require(*packages: str) -> None:
-    for package in packages:
-        if importlib.util.find_spec(package) is None:
-            raise UserError(f"{package} is not installed: pip install 'ventosa[sweep]'")
 
 
 def _sweep(options: argparse.Namespace, stop: Stop) -> int:
