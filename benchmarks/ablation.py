@@ -85,7 +85,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
     recipe, changes = options.recipe, options.changes
     jobs = {
-        (change.slug, seed): job_of(recipe, change, seed, options.steps, options.results)
+        (change.slug, seed): job_of(
+            recipe, change, seed, options.steps, options.results, options.device
+        )
         for seed in options.seeds
         for change in changes
     }
@@ -114,6 +116,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--changes", nargs="+", metavar="NAME", help="default: all there are")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--steps", type=int, default=300_000, help="of each run")
+    parser.add_argument("--device", default="cpu", help="where networks train")
     add_options(parser, "results/ablation")
     options = parser.parse_intermixed_args(arguments)
     options.recipe = recipe = recipes[options.recipe]
@@ -125,14 +128,16 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-def job_of(recipe: Recipe, change: Change, seed: int, steps: int, results: Path) -> Job:
+def job_of(
+    recipe: Recipe, change: Change, seed: int, steps: int, results: Path, device: str = "cpu"
+) -> Job:
     """Training from scratch with a change, then the evaluation."""
     name, folder = f"{recipe.name}-{change.slug}-{steps}-{seed}", results.resolve()
     file = folder / f"{name}.json"
     learn = ["-m", "trainers.learn", str(recipe.run_file), *change.overrides]
     # One checkpoint, the last: the best of several would be of another step in every row.
     learn += [f"trainer.max_steps={steps}", f"trainer.checkpoint_interval={steps}"]
-    learn += ["--seed", str(seed), "--run-id", name]
+    learn += ["--seed", str(seed), "--run-id", name, f"device={device}"]
     # What an interrupted run left has no results; it begins anew.
     learn += ["--results-dir", str(folder / "runs"), "--force"]
     evaluate = ["-m", "trainers.evaluate", str(folder / "runs" / name), *recipe.evaluated]

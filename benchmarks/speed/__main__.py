@@ -5,6 +5,9 @@ PPO on the same environment. All are measured in turn in one run: the median ove
 and the slowest and the fastest round are shown beside it. All of it takes about an hour, most of
 which is training on the largest images; `--sizes 80` takes minutes.
 
+With `--device cuda` the run files of `config/` are measured on the CPU and on that device instead,
+in some three minutes.
+
 With `--track FILE` a fixed set is measured instead, in some two minutes, and added to the file as
 one line of JSON. What fell by more than 10 % since the last line of a like machine is said, and the
 exit code is 1 if that is a ratio to a peer; speeds alone move with whatever else a machine does.
@@ -22,7 +25,7 @@ from benchmarks.command import INSTALL, missing, require
 from trainers.common import process
 from trainers.common.command import tells_failures
 
-PARTS = ("simulator", "environment", "training", "memory")
+PARTS = ("simulator", "environment", "training", "memory", "runs")
 SIZES = (32, 80, 128, 256)
 # A batch is 512 transitions, and there are 32 of each environment in a buffer.
 MIN_ENVS = 16
@@ -54,7 +57,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument(
+        "--parts", nargs="+", choices=PARTS, help="default: all; with --device: runs"
+    )
+    parser.add_argument("--device", default="cpu", help="of the part `runs`, beside the CPU")
     parser.add_argument("--sizes", type=int, nargs="+", choices=SIZES, default=SIZES, help="pixels")
     parser.add_argument(
         "--num-envs",
@@ -67,6 +73,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=2.0, help="of a measurement, at least")
     parser.add_argument("--track", type=Path, metavar="FILE", help="add a line to this history")
     options = parser.parse_args(arguments)
+    options.parts = options.parts or (PARTS if options.device == "cpu" else ("runs",))
     for name, least in (("num_envs", MIN_ENVS), ("repeats", 1)):
         if getattr(options, name) < least:
             parser.error(f"--{name.replace('_', '-')} must be at least {least}")

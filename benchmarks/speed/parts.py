@@ -10,6 +10,7 @@ from rich.table import Table
 from benchmarks.command import missing
 from benchmarks.speed.figures import MODES, Figures, growth, speedup
 from benchmarks.speed.processes import peak_mib, start_s
+from benchmarks.speed.runs import table_of_runs
 from benchmarks.speed.simulation import FRAMES, frames, steps
 from benchmarks.speed.training import PEER_PACKAGES, contenders, training
 from benchmarks.tables import table
@@ -71,7 +72,18 @@ def memory(options: argparse.Namespace) -> Table:
     )
 
 
-PARTS = {"simulator": simulator, "environment": environment, "training": train, "memory": memory}
+def runs(options: argparse.Namespace) -> Table:
+    """Steps per second of the project's own run files, and where their time goes."""
+    return table_of_runs(options.device, options.seconds)
+
+
+PARTS = {
+    "simulator": simulator,
+    "environment": environment,
+    "training": train,
+    "memory": memory,
+    "runs": runs,
+}
 
 
 def comparison(title: str, figures: Figures, caption: str = "") -> Table:

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 from rich.console import Console
 
 from benchmarks.speed.figures import MODES, OURS, PEER, Figures, race
-from trainers.algorithms.ppo import PPOSettings
+from trainers.algorithms.base import TrainerSettings
 from trainers.common.timers import Timer, recording
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.summary import Summary
@@ -51,7 +51,7 @@ class Contender(Protocol):
     parameters: int
 
     def learn(self) -> None:
-        """Fills one buffer and learns from it; times `collect` and `update` as parts."""
+        """Collects once and learns from it; times `collect` and `update` as parts."""
 
     def close(self) -> None:
         """Ends the environments."""
@@ -79,7 +79,7 @@ class Ventosa:
     """Trains as `trainers.learn` does, summaries included; only checkpoints are left out."""
 
     def __init__(self, run: RunSettings):
-        self._settings: PPOSettings = run.trainer.settings  # type: ignore[assignment]
+        self._settings: TrainerSettings = run.trainer.settings  # type: ignore[assignment]
         with ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             self.session = stack.enter_context(closing(Session(run, load_registries())))
@@ -94,10 +94,11 @@ class Ventosa:
 
     def learn(self) -> None:
         """See `Contender`."""
-        steps = self.session.env_runner.step_count + self._settings.hyperparameters.buffer_size
+        session = self.session
+        steps = session.env_runner.step_count + session.algorithm.collection_steps
         settings = self._settings.model_copy(update={"max_steps": steps})
         summary, checkpoints = self._summary, self._checkpoints
-        Training(self.session, settings, self._log, summary, checkpoints, self._display).run()
+        Training(session, settings, self._log, summary, checkpoints, self._display).run()
 
 
 class _NoCheckpoints(Checkpoints):

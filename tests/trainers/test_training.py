@@ -462,12 +462,13 @@ def cut_off(
     algorithm: Any = one.session.algorithm
     take, taken = algorithm._optimizer_step, itertools.count(1)
 
-    def step(*arguments: Any) -> None:
-        take(*arguments)
+    def step(*arguments: Any) -> Any:
+        told = take(*arguments)
         if one.steps > after_steps and next(taken) == optimizer_steps:
             if error is not None:
                 raise error
             one.stop_at_step = 0
+        return told
 
     monkeypatch.setattr(algorithm, "_optimizer_step", step)
 

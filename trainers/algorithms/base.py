@@ -57,9 +57,10 @@ class Algorithm(Protocol):
             Statistics by their TensorBoard tag.
 
         Raises:
-            NonFiniteError: a loss is NaN or infinite; the weights are as before that step.
+            NonFiniteError: a loss is NaN or infinite.
             StopRequested: `env_runner.check_stop`, which a long update should call now and then,
-                says that the run is to stop. What the update changed is taken back.
+                says that the run is to stop.
+            Whatever is raised, what the update changed is not used: the run is saved as before it.
         """
 
     def state_dict(self) -> dict[str, Any]:

@@ -107,7 +107,7 @@ class DDPG(OffPolicyAlgorithm):
         sigma = self._hyperparameters.sigma(run_fraction)
         return super()._schedule(run_fraction) | {"Policy/Noise": sigma}
 
-    def _improve_critic(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
+    def _improve_critic(self, indices: Tensor) -> dict[str, Tensor]:
         """Optimizer step on the mean of (Q(s, a) - y)^2 (Lillicrap et al. 2015, algorithm 1)."""
         online = self.policy.online
         targets = self._targets(indices)
@@ -117,7 +117,7 @@ class DDPG(OffPolicyAlgorithm):
         self._optimizer_step(CRITIC, loss)
         return {"Losses/Value Loss": loss, "Policy/Q Value": values.mean()}
 
-    def _improve_actor(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
+    def _improve_actor(self, indices: Tensor) -> dict[str, Tensor]:
         """Optimizer step on the mean of -Q(s, mu(s))."""
         online = self.policy.online
         observations = self._augment(self._buffer.observations(indices, self._seen))
@@ -126,7 +126,7 @@ class DDPG(OffPolicyAlgorithm):
         return {"Losses/Policy Loss": loss}
 
     @torch.no_grad()
-    def _bootstrapped_returns(self, indices: NDArray[np.int64]) -> Tensor:
+    def _bootstrapped_returns(self, indices: Tensor) -> Tensor:
         """Targets y = R + gamma^k Q'(s', mu'(s')), (B,); R is the return of k steps up to s'."""
         hyper, target = self._hyperparameters, self.policy.target
         returns, discounts, last = self._buffer.returns(indices, hyper.gamma, hyper.n_step)

@@ -14,9 +14,15 @@ from torch import Tensor, nn
 
 from trainers.algorithms.augmentation import RandomShift, unchanged
 from trainers.algorithms.base import TrainerSettings
-from trainers.algorithms.optimization import load_optimizer, optimizer_step
+from trainers.algorithms.captured import Captured
+from trainers.algorithms.optimization import (
+    adam,
+    check_finite,
+    load_optimizer,
+    optimizer_step,
+    set_learning_rates,
+)
 from trainers.algorithms.schedules import CONSTANT, Schedule
-from trainers.common.averager import Averager
 from trainers.experience.collector import BehaviorOutput, CollectedStep, Collector
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.memory import check_room
@@ -26,6 +32,8 @@ from trainers.networks.observations import Observations
 from trainers.networks.off_policy_network import OffPolicyNetwork
 
 ACTOR, CRITIC = "actor", "critic"
+STEPS = "steps"
+"""Name, beside the statistics of a round, of what its optimizer steps said, (steps, 2)."""
 
 
 class OffPolicyHyperparameters(BaseModel, frozen=True, extra="forbid"):
@@ -153,7 +161,7 @@ class OffPolicyAlgorithm(ABC):
         self._hyperparameters = hyper = settings.hyperparameters
         self._env_runner, self._generator, self._device = env_runner, generator, device
         self._parameters = parameters
-        self._optimizers = {k: torch.optim.Adam(p, fused=True) for k, p in parameters.items()}
+        self._optimizers = {name: adam([part], device) for name, part in parameters.items()}
         env, size = env_runner.env, policy.scale.size
         self._seen = {*policy.sees, *policy.critic_sees}
         self._actions_shape = (env.num_envs, size)
@@ -169,6 +177,8 @@ class OffPolicyAlgorithm(ABC):
         self._collector: Collector[Tensor] = Collector(self, env_runner, device)
         self._collected: list[CollectedStep[Tensor]] = []
         self._pending_updates = 0.0  # asked for by transitions, and not made yet
+        self._steps_taken: list[Tensor] = []  # in this round
+        self._improve = Captured(self._improve_all, generator, device)
 
     # -- the subclass's --------------------------------------------------------------------------
 
@@ -177,12 +187,15 @@ class OffPolicyAlgorithm(ABC):
         """Actions (N, A) in [-1, 1], with what the algorithm explores by."""
 
     @abstractmethod
-    def _improve_critic(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
+    def _improve_critic(self, indices: Tensor) -> dict[str, Tensor]:
         """One optimizer step of the critic on transitions (B,); statistics by TensorBoard tag."""
 
     @abstractmethod
-    def _improve_actor(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
-        """One optimizer step of the actor on transitions (B,); statistics by TensorBoard tag."""
+    def _improve_actor(self, indices: Tensor) -> dict[str, Tensor]:
+        """One optimizer step of the actor on transitions (B,); statistics by TensorBoard tag.
+
+        Both are captured, see `Captured`: they read nothing back from the device.
+        """
 
     def _episodes_ended(self, done: NDArray[np.bool_]) -> None:  # noqa: B027 - may stay empty
         """Called after every step with (N,), for exploration with a state."""
@@ -227,32 +240,47 @@ class OffPolicyAlgorithm(ABC):
             raise RuntimeError("update() comes after collect()")
         scheduled = self._schedule(run_fraction)
         self._store_collected()
-        averager, hyper = Averager(), self._hyperparameters
+        hyper = self._hyperparameters
         if len(self._buffer) >= hyper.buffer_init_steps:
             self._pending_updates += self.collection_steps * hyper.updates_per_step
-        while self._pending_updates >= hyper.policy_delay:
-            self._pending_updates -= hyper.policy_delay
-            averager.add(self._update_once())
-        return averager.pop_means() | scheduled
+        rounds, self._pending_updates = divmod(self._pending_updates, hyper.policy_delay)
+        if not rounds:
+            return scheduled
+        drawn = (int(rounds), hyper.policy_delay, hyper.batch_size)
+        statistics = []
+        for indices in self._buffer.sample(drawn, self._generator):
+            self._env_runner.check_stop()
+            statistics.append(self._improve(indices))
+        return self._means(statistics) | scheduled
+
+    def _means(self, statistics: Sequence[dict[str, Tensor]]) -> dict[str, float]:
+        """Means of the rounds' statistics.
+
+        Raises:
+            NonFiniteError: a loss was NaN or infinite, or its gradient.
+        """
+        # All at once: on an accelerator what is read waits for all that is under way.
+        for step in torch.cat([each.pop(STEPS) for each in statistics]).tolist():
+            check_finite(step, self._env_runner.step_count)
+        means = torch.stack([torch.stack(tuple(each.values())) for each in statistics]).mean(dim=0)
+        return dict(zip(statistics[0], means.tolist(), strict=True))
 
     def _schedule(self, run_fraction: float) -> dict[str, float]:
         """Sets what changes over the run; returns it by TensorBoard tag."""
         rate, critic_rate = self._hyperparameters.learning_rates(run_fraction)
         for name, optimizer in self._optimizers.items():
-            optimizer.param_groups[0]["lr"] = critic_rate if name == CRITIC else rate
+            set_learning_rates(optimizer, [critic_rate if name == CRITIC else rate])
         return {"Policy/Learning Rate": rate, "Policy/Critic Learning Rate": critic_rate}
 
-    def _update_once(self) -> dict[str, float]:
-        """Updates the critic `policy_delay` times, the actor and the targets once."""
-        hyper = self._hyperparameters
-        for _ in range(hyper.policy_delay):
-            indices = self._buffer.sample(hyper.batch_size, self._generator)
-            statistics = self._improve_critic(indices)
-        statistics |= self._improve_actor(indices)
+    def _improve_all(self, indices: Tensor) -> dict[str, Tensor]:
+        """Updates the critic once for each of (policy_delay, B), then the actor and the targets."""
+        self._steps_taken = []
+        for each in indices:
+            statistics = self._improve_critic(each)
+        statistics |= self._improve_actor(each)
         self.policy.update_targets()
-        # All at once: on an accelerator each number read waits for all that is under way.
-        numbers = torch.stack([value.detach() for value in statistics.values()]).tolist()
-        return dict(zip(statistics, numbers, strict=True))
+        detached = {name: value.detach() for name, value in statistics.items()}
+        return detached | {STEPS: torch.stack(self._steps_taken)}
 
     def _store_collected(self) -> None:
         """Moves what was collected to the buffer and to the statistics of the observations.
@@ -267,20 +295,10 @@ class OffPolicyAlgorithm(ABC):
         self.policy.update_statistics({k: torch.cat([v[k] for v in vectors]) for k in vectors[0]})
 
     def _optimizer_step(self, name: str, loss: Tensor) -> None:
-        """One step of the optimizer of that name, with clipped gradients.
-
-        Raises:
-            StopRequested: the run is to stop; nothing was changed.
-            NonFiniteError: the loss or its gradient is NaN or infinite; nothing was changed.
-        """
-        self._env_runner.check_stop()
-        optimizer_step(
-            self._optimizers[name],
-            loss,
-            self._parameters[name],
-            self._max_gradient_norm,
-            self._env_runner.step_count,
-        )
+        """One step of the optimizer of that name, with clipped gradients, if all is finite."""
+        optimizer, parameters = self._optimizers[name], self._parameters[name]
+        step = optimizer_step(optimizer, loss, parameters, self._max_gradient_norm)
+        self._steps_taken.append(step)
 
     # -- the state -------------------------------------------------------------------------------
 
@@ -303,3 +321,4 @@ class OffPolicyAlgorithm(ABC):
             load_optimizer(optimizer, state[f"{name}_optimizer"])
         self._generator.set_state(state["generator"])
         self._pending_updates = state["due"]
+        self._improve = Captured(self._improve_all, self._generator, self._device)

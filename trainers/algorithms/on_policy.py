@@ -10,7 +10,7 @@ from gymnasium.spaces import Box
 from pydantic import BaseModel, Field, model_validator
 from torch import Tensor, nn
 
-from trainers.algorithms.optimization import load_optimizer, optimizer_step
+from trainers.algorithms.optimization import adam, load_optimizer, optimizer_step
 from trainers.algorithms.schedules import LINEAR, Schedule
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner
@@ -89,9 +89,7 @@ class OnPolicyAlgorithm:
         device: torch.device,
     ):
         self.policy = policy
-        self._optimizer = torch.optim.Adam(
-            [{"params": list(group)} for group in groups], eps=1e-5, fused=True
-        )
+        self._optimizer = adam(groups, device, eps=1e-5)
         self._gamma, self._lambd = hyperparameters.gamma, hyperparameters.lambd
         if hyperparameters.antithetic and not isinstance(env_runner.env.single_action_space, Box):
             raise UserError(
@@ -143,14 +141,12 @@ class OnPolicyAlgorithm:
             raise RuntimeError("update() comes after collect()")
         return rollout
 
-    def _optimizer_step(self, loss: Tensor) -> None:
-        """One step of gradient descent.
+    def _optimizer_step(self, loss: Tensor) -> Tensor:
+        """One step of gradient descent, if all is finite; see `optimizer_step`.
 
         Raises:
             StopRequested: the run is to stop; nothing was changed.
-            NonFiniteError: the loss or its gradient is NaN or infinite; nothing was changed.
         """
         self._env_runner.check_stop()
         parameters = [p for group in self._optimizer.param_groups for p in group["params"]]
-        step = self._env_runner.step_count
-        optimizer_step(self._optimizer, loss, parameters, self._max_gradient_norm, step)
+        return optimizer_step(self._optimizer, loss, parameters, self._max_gradient_norm)

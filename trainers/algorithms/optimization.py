@@ -1,9 +1,9 @@
-"""Steps of gradient descent that stop a run before it breaks."""
+"""Steps of gradient descent."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -12,47 +12,84 @@ from torch import Tensor, nn
 from trainers.common.errors import NonFiniteError
 
 
+def adam(
+    groups: Iterable[Iterable[nn.Parameter]], device: torch.device, eps: float = 1e-8
+) -> torch.optim.Adam:
+    """Adam with one learning rate per group of parameters, which `set_learning_rates` sets.
+
+    On an accelerator the rates are tensors, and all of a step can be captured in a graph.
+    """
+    captured = device.type == "cuda"
+    return torch.optim.Adam(
+        [
+            {"params": list(group), "lr": torch.zeros((), device=device) if captured else 0.0}
+            for group in groups
+        ],
+        eps=eps,
+        fused=True,
+        capturable=captured,
+    )
+
+
+def set_learning_rates(optimizer: torch.optim.Optimizer, rates: Sequence[float]) -> None:
+    """Sets the learning rates of an optimizer's groups."""
+    for group, rate in zip(optimizer.param_groups, rates, strict=True):
+        if isinstance(group["lr"], Tensor):
+            group["lr"].fill_(rate)
+        else:
+            group["lr"] = rate
+
+
 def optimizer_step(
     optimizer: torch.optim.Optimizer,
     loss: Tensor,
     parameters: Sequence[nn.Parameter],
     max_gradient_norm: float,
-    step: int,
-) -> None:
+) -> Tensor:
     """Takes one step down the gradient of a loss with respect to some parameters, and no others.
 
+    Where the loss or its gradient is not finite, the parameters stay as they are. Nothing is read
+    back from the device to find out: that is for `check_finite`, when the caller reads anyway.
+
     Args:
-        optimizer: of the parameters.
+        optimizer: of the parameters, fused.
         loss: a number.
         parameters: what may change; frozen ones among them stay as they are.
         max_gradient_norm: the gradient is clipped to this norm.
-        step: of the run, for the message.
 
-    Raises:
-        NonFiniteError: the loss or its gradient is not finite; the parameters are as before.
+    Returns:
+        The loss and its gradient's norm before it was clipped, (2,), without a gradient.
     """
     learned = [parameter for parameter in parameters if parameter.requires_grad]
     gradients = torch.autograd.grad(loss, learned, allow_unused=True)
     for parameter, gradient in zip(learned, gradients, strict=True):
         parameter.grad = gradient
     norm = nn.utils.get_total_norm([part for part in gradients if part is not None])
-    if check_finite(loss, norm, step) > max_gradient_norm:
+    if math.isfinite(max_gradient_norm):
         nn.utils.clip_grads_with_norm_(learned, max_gradient_norm, norm)
+    loss_and_norm = torch.stack((loss.detach(), norm))
+    # What torch's gradient scaler sets, too: a fused optimizer takes no step where it is 1.
+    optimizer.found_inf = 1.0 - loss_and_norm.isfinite().all().float()  # type: ignore[attr-defined]
     optimizer.step()
+    return loss_and_norm
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
-    """Takes an optimizer back to a state.
+    """Takes an optimizer back to a state; its settings, learning rates included, stay its own.
 
     Raises:
         ValueError: it is that of other parameters, or of another optimizer: torch itself would
             notice at the next step only.
     """
-    settings = [group.keys() for group in optimizer.param_groups]
+    settings = [
+        {name: value for name, value in group.items() if name != "params"}
+        for group in optimizer.param_groups
+    ]
     optimizer.load_state_dict(state)
     for known, group in zip(settings, optimizer.param_groups, strict=True):
-        if missing := known - group.keys():
+        if missing := known.keys() - group.keys():
             raise ValueError(f"the optimizer's state has no {', '.join(sorted(missing))}")
+        group.update(known)
     for parameter, moments in optimizer.state.items():
         found = {name: (tuple(each.shape), each.dtype) for name, each in moments.items()}
         own = tuple(parameter.shape), parameter.dtype
@@ -60,14 +97,12 @@ def load_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> N
             raise ValueError(f"the optimizer's state of a parameter {own} has {found}")
 
 
-def check_finite(loss: Tensor, gradient_norm: Tensor, step: int) -> float:
-    """The gradient's norm as a number.
+def check_finite(loss_and_norm: Sequence[float], step: int) -> None:
+    """Refuses a loss or a norm of its gradient that is NaN or infinite.
 
     Raises:
-        NonFiniteError: the loss or the norm is not finite; the message names the run's step.
+        NonFiniteError: one is; the message names the run's step.
     """
-    # Both at once: on an accelerator each number read waits for all that is under way.
-    value, norm = torch.stack((loss.detach(), gradient_norm)).tolist()
-    if not math.isfinite(value + norm):
-        raise NonFiniteError(f"step {step}: the loss is {value}, its gradient's norm {norm}")
-    return float(norm)
+    loss, norm = loss_and_norm
+    if not math.isfinite(loss + norm):
+        raise NonFiniteError(f"step {step}: the loss is {loss}, its gradient's norm {norm}")

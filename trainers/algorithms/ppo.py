@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from trainers.algorithms.base import TrainerSettings
 from trainers.algorithms.on_policy import OnPolicyAlgorithm, OnPolicyHyperparameters
+from trainers.algorithms.optimization import check_finite, set_learning_rates
 from trainers.algorithms.schedules import CONSTANT, LINEAR, Schedule
 from trainers.common.averager import Averager
 from trainers.experience.env_runner import EnvRunner
@@ -131,8 +132,8 @@ class PPO(OnPolicyAlgorithm):
         )
         # One group where actor and critic share their rate.
         learning_rates = (scheduled.learning_rate, scheduled.critic_learning_rate)
-        for group, rate in zip(self._optimizer.param_groups, learning_rates, strict=False):
-            group["lr"] = rate
+        groups = len(self._optimizer.param_groups)
+        set_learning_rates(self._optimizer, learning_rates[:groups])
         return scheduled
 
     def _epoch(
@@ -162,10 +163,12 @@ class PPO(OnPolicyAlgorithm):
             for weight, term in ((-scheduled.beta, entropy), (hyper.kl_penalty, divergence)):
                 if weight:  # the gradient of what weighs nothing costs as much as any
                     loss = loss + weight * term
-            self._optimizer_step(loss)
-            # All at once: on an accelerator each number read waits for all that is under way.
+            step = self._optimizer_step(loss)
             statistics = torch.stack((divergence, clip_fraction, policy_loss, value_loss, entropy))
-            kl, *_ = means = statistics.tolist()
+            # All at once: on an accelerator each number read waits for all that is under way.
+            *loss_and_norm, kl, _, _, _, _ = numbers = torch.cat((step, statistics)).tolist()
+            check_finite(loss_and_norm, self._env_runner.step_count)
+            means = numbers[len(loss_and_norm) :]
             averager.add(dict(zip(STATISTICS, means, strict=True)), len(rows))
             if hyper.target_kl is not None and kl > hyper.target_kl:
                 return False

@@ -24,7 +24,7 @@ from torch.nn import functional as F
 from trainers.algorithms.base import TrainerSettings
 from trainers.algorithms.conjugate_gradient import conjugate_gradient
 from trainers.algorithms.on_policy import OnPolicyAlgorithm, OnPolicyHyperparameters
-from trainers.algorithms.optimization import check_finite
+from trainers.algorithms.optimization import check_finite, set_learning_rates
 from trainers.algorithms.schedules import CONSTANT, Schedule
 from trainers.common.averager import Averager
 from trainers.experience.env_runner import EnvRunner
@@ -124,8 +124,7 @@ class TRPO(OnPolicyAlgorithm):
         rollout, hyper = self._pop_rollout(), self._hyperparameters
         delta = hyper.delta_schedule.value(hyper.delta, run_fraction)
         rate = hyper.learning_rate_schedule.value(hyper.learning_rate, run_fraction)
-        (critic,) = self._optimizer.param_groups
-        critic["lr"] = rate
+        set_learning_rates(self._optimizer, [rate])
         statistics = self._improve_policy(rollout, delta)
         statistics |= self._fit_critic(rollout)
         self.policy.update_statistics(rollout.vectors)
@@ -149,7 +148,7 @@ class TRPO(OnPolicyAlgorithm):
         distribution = self.policy.distribution(observations)
         gain, old = gain_of(distribution), distribution.detach()
         gradient = flat_gradient(gain, self._theta)
-        check_finite(-gain, gradient.norm(), self._env_runner.step_count)
+        check_finite((-gain.item(), gradient.norm().item()), self._env_runner.step_count)
 
         def measure() -> tuple[Tensor, Tensor]:
             new = self.policy.distribution(observations)
@@ -196,8 +195,9 @@ class TRPO(OnPolicyAlgorithm):
             for rows in rollout.minibatches(hyper.batch_size, self._generator):
                 values = self.policy.value(rollout.observations(rows))
                 loss = F.mse_loss(values, rollout.returns[rows])
-                self._optimizer_step(loss)
-                averager.add({"Losses/Value Loss": loss.item()}, len(rows))
+                step = self._optimizer_step(loss).tolist()
+                check_finite(step, self._env_runner.step_count)
+                averager.add({"Losses/Value Loss": step[0]}, len(rows))
         return averager.pop_means()
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from trainers.networks.observations import is_frame
+from trainers.networks.observations import is_frame, torch_dtype
 
 
 class FrameStore:
@@ -32,7 +32,9 @@ class FrameStore:
         device: torch.device,
     ):
         self._tensors = {
-            name: torch.empty((capacity, *(space.shape or ())), dtype=_dtype(space), device=device)
+            name: torch.empty(
+                (capacity, *(space.shape or ())), dtype=torch_dtype(space.dtype), device=device
+            )
             for name, space in spaces.items()
         }
         self.count = 0
@@ -54,8 +56,3 @@ class FrameStore:
 def frame_spaces(space: gymnasium.spaces.Dict) -> dict[str, gymnasium.Space[Any]]:
     """The spaces of the images among the observations."""
     return {name: part for name, part in space.spaces.items() if is_frame(part)}
-
-
-def _dtype(space: gymnasium.Space[Any]) -> torch.dtype:
-    """Torch's name of the type of a space's numbers."""
-    return torch.from_numpy(np.empty(0, space.dtype)).dtype

@@ -9,7 +9,7 @@ to it is overwritten.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import gymnasium
@@ -21,12 +21,21 @@ from torch import Tensor
 from envs.memory import shortage, space_bytes
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import Step
-from trainers.networks.observations import Observations, frames_differ, is_frame
+from trainers.networks.observations import (
+    Observations,
+    frames_differ,
+    gather,
+    is_frame,
+    scatter,
+    torch_dtype,
+    where,
+)
 
 NONE = -1
 BYTES_BESIDE = 38
 """Of a transition, next to its observations and its action."""
 _FRAME = ""  # no observation has this name
+_FLOAT, _INTEGER, _BOOLEAN = map(np.dtype, (np.float32, np.int64, np.bool_))
 _Kind = tuple[tuple[int, ...], np.dtype[Any]]
 """Shape and type of one entry."""
 
@@ -41,7 +50,8 @@ class ReplayBuffer:
         action_size: A, length of an action.
         num_envs: N.
         capacity: transitions kept, over all environments; rounded up to a multiple of N.
-        device: of the tensors that are handed out; the experience itself is in main memory.
+        device: where the experience is kept, and handed out; on an accelerator nothing of it moves
+            when it is drawn, and no shape depends on what is drawn.
 
     Raises:
         UserError: there is no room for that many.
@@ -55,7 +65,7 @@ class ReplayBuffer:
         capacity: int,
         device: torch.device,
     ):
-        self._num_envs, self._device = num_envs, device
+        self._num_envs = num_envs
         self._steps = -(-capacity // num_envs)
         self._rows = self._steps + 1  # one more, for the present observations
         size = self._rows * num_envs
@@ -67,23 +77,25 @@ class ReplayBuffer:
                 "lower it"
             )
         try:
-            # Memory of zeros is given page by page when it is first written to, so that what
-            # frames in common and unfinished episodes leave unused costs nothing.
-            self._vectors = {k: np.zeros((size, *s), dtype) for k, (s, dtype) in vectors.items()}
-            self._actions = np.zeros((size, action_size), np.float32)
-            self._frames = _Slots(frames, 2 * size if frames else 0)
-            self._finals = _Slots(vectors | {_FRAME: ((), np.dtype(np.int64))}, size)
-        except MemoryError as error:
+            self._vectors = {k: _zeros((size, *s), d, device) for k, (s, d) in vectors.items()}
+            self._actions = _zeros((size, action_size), _FLOAT, device)
+            self._frames = _Slots(frames, 2 * size if frames else 0, device)
+            self._finals = _Slots(vectors | {_FRAME: ((), _INTEGER)}, size, device)
+        except (MemoryError, torch.OutOfMemoryError) as error:
             raise UserError(
                 f"trainer.hyperparameters.buffer_size: there is no room for {capacity} transitions "
                 f"({error}): lower it"
             ) from error
-        self._rewards = np.zeros(size, np.float32)
-        self._terminated = np.zeros(size, bool)
-        self._done = np.zeros(size, bool)
-        self._frame = np.zeros(size, np.int64)  # slot of each observation's images
-        self._final = np.full(size, NONE)  # slot of the last observation, where one was cut off
+        self._rewards = _zeros((size,), _FLOAT, device)
+        self._terminated = _zeros((size,), _BOOLEAN, device)
+        self._done = _zeros((size,), _BOOLEAN, device)
+        # Slots of each observation's images, and of the last observation where one was cut off:
+        # for the books and, which on the CPU is the same memory, for what is drawn.
+        self._frame, self._final = np.zeros(size, np.int64), np.full(size, NONE)
+        self._frame_slots = torch.from_numpy(self._frame).to(device)
+        self._final_slots = torch.from_numpy(self._final).to(device)
         self._row = 0  # of the present observations
+        self._present = torch.zeros((), dtype=torch.int64, device=device)  # the same
         self._length = 0  # rows with a transition
 
     def __len__(self) -> int:
@@ -108,11 +120,13 @@ class ReplayBuffer:
         if not self._length:
             self._frame[here] = self._frames.add(observations, np.arange(self._num_envs))
             self._keep_vectors(here, observations)
-        self._actions[here], self._rewards[here] = actions, step.reward
-        self._terminated[here] = step.terminated
-        self._done[here] = step.done
+        self._actions[here] = torch.from_numpy(actions)
+        self._rewards[here] = torch.from_numpy(step.reward)
+        self._terminated[here] = torch.from_numpy(step.terminated)
+        self._done[here] = torch.from_numpy(step.done)
         self._keep_final(here, observations, step)
         self._row = (self._row + 1) % self._rows
+        self._present.fill_(self._row)
         there = self._row_indices(self._row)
         if self._length == self._steps:
             self._release(there)
@@ -122,32 +136,30 @@ class ReplayBuffer:
         new = np.flatnonzero(~step.same_frame)
         self._frame[there] = self._frame[here]
         self._frame[there][new] = self._frames.add(next_observations, new)
+        for rows in (here, there):
+            self._frame_slots[rows] = torch.from_numpy(self._frame[rows])
+        self._final_slots[here] = torch.from_numpy(self._final[here])
 
-    def sample(self, count: int, generator: torch.Generator) -> NDArray[np.int64]:
-        """Draws transitions, each as likely as any other: their indices (count,)."""
-        drawn = torch.randint(
-            len(self), (count,), generator=generator, device=generator.device
-        ).cpu()
+    def sample(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
+        """Draws transitions, each as likely as any other: their indices, of some shape."""
+        drawn = torch.randint(len(self), shape, generator=generator, device=generator.device)
         oldest = (self._row - self._length) * self._num_envs
-        indices: NDArray[np.int64] = (oldest + drawn.numpy()) % len(self._rewards)
-        return indices
+        return (oldest + drawn) % len(self._rewards)
 
-    def observations(self, indices: NDArray[np.int64], names: Collection[str]) -> Observations:
+    def observations(self, indices: Tensor, names: Collection[str]) -> Observations:
         """Observations before the transitions (B,), those of `names`."""
-        vectors = {k: values[indices] for k, values in self._vectors.items() if k in names}
-        return self._tensors(vectors, self._frame[indices], names)
+        vectors = {k: gather(v, indices) for k, v in self._vectors.items() if k in names}
+        return self._with_frames(vectors, self._frame_slots[indices], names)
 
-    def actions(self, indices: NDArray[np.int64]) -> Tensor:
+    def actions(self, indices: Tensor) -> Tensor:
         """Actions (B, A)."""
-        return self._to_device(self._actions[indices])
+        return self._actions[indices]
 
-    def rewards(self, indices: NDArray[np.int64]) -> Tensor:
+    def rewards(self, indices: Tensor) -> Tensor:
         """Rewards (B,)."""
-        return self._to_device(self._rewards[indices])
+        return self._rewards[indices]
 
-    def returns(
-        self, indices: NDArray[np.int64], gamma: float, steps: int
-    ) -> tuple[Tensor, Tensor, NDArray[np.int64]]:
+    def returns(self, indices: Tensor, gamma: float, steps: int) -> tuple[Tensor, Tensor, Tensor]:
         """Returns of up to n steps, within the episode and within what is known.
 
         R = r_t + gamma r_t+1 + ... + gamma^(k-1) r_t+k-1, where k is n, or less where the episode
@@ -163,43 +175,39 @@ class ReplayBuffer:
             terminated; and the indices (B,) of the last transitions of the returns.
         """
         last, total = indices, self._rewards[indices]
-        discount = np.full(len(indices), gamma, np.float32)
+        discount = torch.full_like(total, gamma)
         for power in range(1, steps):
             next_indices = self._after(last)
-            unknown = next_indices // self._num_envs == self._row
+            unknown = next_indices // self._num_envs == self._present
             goes_on = ~(self._done[last] | unknown)
-            last = np.where(goes_on, next_indices, last)
-            total[goes_on] += gamma**power * self._rewards[next_indices[goes_on]]
-            discount[goes_on] *= gamma
-        discount[self._terminated[last]] = 0.0
-        return self._to_device(total), self._to_device(discount), last
+            last = torch.where(goes_on, next_indices, last)
+            total += torch.where(goes_on, gamma**power * self._rewards[next_indices], 0.0)
+            discount = torch.where(goes_on, gamma * discount, discount)
+        return total, discount.masked_fill(self._terminated[last], 0.0), last
 
-    def next_observations(self, indices: NDArray[np.int64], names: Collection[str]) -> Observations:
+    def next_observations(self, indices: Tensor, names: Collection[str]) -> Observations:
         """Observations after the transitions (B,), those of `names`.
 
         Where an episode was cut off, its last ones; where it terminated, any, as none has a value.
         """
-        next_indices = self._after(indices)
-        vectors = {k: values[next_indices] for k, values in self._vectors.items() if k in names}
-        frame, final = self._frame[next_indices], self._final[indices]
-        cut = np.flatnonzero(final != NONE)
-        if len(cut):
-            kept = self._finals.gather(final[cut], (_FRAME, *vectors))
-            frame[cut] = kept[_FRAME]
-            for name, values in vectors.items():
-                values[cut] = kept[name]
-        return self._tensors(vectors, frame, names)
+        next_indices, final = self._after(indices), self._final_slots[indices]
+        cut = final != NONE
+        wanted = [name for name in self._vectors if name in names]
+        kept = self._finals.gather(final.clamp(min=0), (_FRAME, *wanted))
+        frame = where(cut, kept[_FRAME], self._frame_slots[next_indices])
+        vectors = {k: where(cut, kept[k], gather(self._vectors[k], next_indices)) for k in wanted}
+        return self._with_frames(vectors, frame, names)
 
     def state_dict(self) -> dict[str, Any]:
-        """All experience, without a copy: it holds until the next `add`."""
+        """All experience: on the CPU without a copy, so that it holds until the next `add`."""
         rows = self._rows if self._length == self._steps else self._row + 1
         used = slice(rows * self._num_envs)
         return {
             "size": len(self._rewards),
             "row": self._row,
             "length": self._length,
-            "fields": {name: array[used] for name, array in self._fields().items()},
-            "vectors": {name: array[used] for name, array in self._vectors.items()},
+            "fields": {name: _array(values[used]) for name, values in self._fields().items()},
+            "vectors": {name: _array(values[used]) for name, values in self._vectors.items()},
             "frames": self._frames.state_dict(),
             "finals": self._finals.state_dict(),
         }
@@ -213,34 +221,36 @@ class ReplayBuffer:
         if state["size"] != len(self._rewards):
             raise ValueError("its replay buffer has another size: buffer_size must stay as it was")
         for arrays, saved in ((self._fields(), "fields"), (self._vectors, "vectors")):
-            for name, array in arrays.items():
-                array[: len(state[saved][name])] = state[saved][name]
+            for name, tensor in arrays.items():
+                tensor[: len(state[saved][name])] = torch.from_numpy(state[saved][name])
         self._frames.load_state_dict(state["frames"])
         self._finals.load_state_dict(state["finals"])
+        for books, slots in ((self._frame, self._frame_slots), (self._final, self._final_slots)):
+            books[:] = _array(slots)
         self._row, self._length = state["row"], state["length"]
+        self._present.fill_(self._row)
 
-    def _fields(self) -> dict[str, NDArray[Any]]:
+    def _fields(self) -> dict[str, Tensor]:
         return {
             "actions": self._actions,
             "rewards": self._rewards,
             "terminated": self._terminated,
             "done": self._done,
-            "frame": self._frame,
-            "final": self._final,
+            "frame": self._frame_slots,
+            "final": self._final_slots,
         }
 
     def _row_indices(self, row: int) -> slice:
         row %= self._rows
         return slice(row * self._num_envs, (row + 1) * self._num_envs)
 
-    def _after(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _after(self, indices: Tensor) -> Tensor:
         """Indices of the next row."""
-        next_indices: NDArray[np.int64] = (indices + self._num_envs) % len(self._rewards)
-        return next_indices
+        return (indices + self._num_envs) % len(self._rewards)
 
     def _keep_vectors(self, indices: slice, observations: Mapping[str, NDArray[Any]]) -> None:
         for name, values in self._vectors.items():
-            values[indices] = observations[name]
+            values[indices] = torch.from_numpy(np.ascontiguousarray(observations[name]))
 
     def _keep_final(
         self, indices: slice, observations: Mapping[str, NDArray[Any]], step: Step
@@ -264,28 +274,18 @@ class ReplayBuffer:
         frame, final = self._frame[indices], self._final[indices]
         cut = np.flatnonzero(final != NONE)
         if len(cut):
-            kept = self._finals.gather(final[cut], (_FRAME,))[_FRAME]
+            kept = _array(self._finals.gather(torch.from_numpy(final[cut]), (_FRAME,))[_FRAME])
             self._frames.release(kept[kept != frame[cut]])
             self._finals.release(final[cut])
         next_frame = self._frame[self._row_indices(indices.start // self._num_envs + 1)]
         self._frames.release(frame[frame != next_frame])
 
-    def _tensors(
-        self,
-        vectors: Mapping[str, NDArray[Any]],
-        frame: NDArray[np.int64],
-        names: Collection[str],
+    def _with_frames(
+        self, vectors: dict[str, Tensor], slots: Tensor, names: Collection[str]
     ) -> Observations:
-        tensors = {name: self._to_device(values) for name, values in vectors.items()}
-        images = self._frames.names.intersection(names)
-        if not images:
-            return Observations({}, tensors)
-        slots, index = np.unique(frame, return_inverse=True)
-        frames = {k: self._to_device(v) for k, v in self._frames.gather(slots, images).items()}
-        return Observations(frames, tensors, self._to_device(index))
-
-    def _to_device(self, array: NDArray[Any]) -> Tensor:
-        return torch.from_numpy(array).to(self._device)
+        return Observations(
+            self._frames.gather(slots, self._frames.names.intersection(names)), vectors
+        )
 
 
 class _Slots:
@@ -295,8 +295,8 @@ class _Slots:
     that was in use at a time.
     """
 
-    def __init__(self, kinds: Mapping[str, _Kind], capacity: int):
-        self._arrays = {name: np.zeros((capacity, *s), dtype) for name, (s, dtype) in kinds.items()}
+    def __init__(self, kinds: Mapping[str, _Kind], capacity: int, device: torch.device):
+        self._tensors = {k: _zeros((capacity, *s), d, device) for k, (s, d) in kinds.items()}
         self._free = _descending(capacity)  # a stack, its top at the end
         self._left = capacity
         self._touched = 0
@@ -308,14 +308,14 @@ class _Slots:
             return np.zeros(len(rows), np.int64)
         self._left -= len(rows)
         slots = self._free[self._left : self._left + len(rows)].copy()
-        for name, array in self._arrays.items():
-            array[slots] = values[name][rows]
+        for name, tensor in self._tensors.items():
+            scatter(tensor, torch.from_numpy(slots), torch.from_numpy(values[name][rows]))
         self._touched = max(self._touched, len(self._free) - self._left)
         return slots
 
-    def gather(self, slots: NDArray[np.int64], names: Collection[str]) -> dict[str, NDArray[Any]]:
+    def gather(self, slots: Tensor, names: Iterable[str]) -> dict[str, Tensor]:
         """Copies of some entries, those of `names`."""
-        return {name: self._arrays[name][slots] for name in names}
+        return {name: gather(self._tensors[name], slots) for name in names}
 
     def release(self, slots: NDArray[np.int64]) -> None:
         """Gives slots back."""
@@ -324,22 +324,39 @@ class _Slots:
             self._left += len(slots)
 
     def state_dict(self) -> dict[str, Any]:
-        """All entries, without a copy."""
+        """All entries, on the CPU without a copy."""
         never_used = len(self._free) - self._touched
         return {
             "free": self._free[never_used : self._left],
-            "entries": {name: array[: self._touched] for name, array in self._arrays.items()},
+            "entries": {k: _array(tensor[: self._touched]) for k, tensor in self._tensors.items()},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Goes back to a state of slots of the same capacity."""
-        for name, array in self._arrays.items():
+        for name, tensor in self._tensors.items():
             self._touched = len(state["entries"][name])
-            array[: self._touched] = state["entries"][name]
+            tensor[: self._touched].copy_(torch.from_numpy(state["entries"][name]))
         never_used = len(self._free) - self._touched
         self._left = never_used + len(state["free"])
         self._free[:never_used] = _descending(len(self._free))[:never_used]
         self._free[never_used : self._left] = state["free"]
+
+
+def _zeros(shape: tuple[int, ...], dtype: np.dtype[Any], device: torch.device) -> Tensor:
+    """Zeros; numpy's, on the CPU.
+
+    Memory of those is given page by page when it is first written to, so that what frames in common
+    and unfinished episodes leave unused costs nothing.
+    """
+    if device.type == "cpu":
+        return torch.from_numpy(np.zeros(shape, dtype))
+    return torch.zeros(shape, dtype=torch_dtype(dtype), device=device)
+
+
+def _array(tensor: Tensor) -> NDArray[Any]:
+    """The same numbers; on the CPU in the same memory."""
+    array: NDArray[Any] = tensor.cpu().numpy()
+    return array
 
 
 def _kind(space: gymnasium.Space[Any]) -> _Kind:

@@ -20,6 +20,7 @@ from encoders.spaces import PointCloud
 from trainers.networks.recurrent import Sequences
 
 IMAGE_DIMENSIONS = 3
+_SIGNED = {torch.uint16: torch.int16, torch.uint32: torch.int32, torch.uint64: torch.int64}
 
 
 @dataclass(frozen=True)
@@ -68,10 +69,28 @@ def to_tensors(
 
 def gather(tensor: Tensor, index: Tensor | tuple[Tensor, ...]) -> Tensor:
     """Entries of a tensor of any type."""
-    # torch indexes uint16 through its signed twin, which has all the operations.
-    if tensor.dtype == torch.uint16:
-        return tensor.view(torch.int16)[index].view(torch.uint16)
-    return tensor[index]
+    return _signed(tensor)[index].view(tensor.dtype)
+
+
+def scatter(tensor: Tensor, index: Tensor, values: Tensor) -> None:
+    """Replaces entries of a tensor of any type by values (B, ...)."""
+    _signed(tensor)[index] = _signed(values).to(tensor.device)
+
+
+def where(mask: Tensor, values: Tensor, others: Tensor) -> Tensor:
+    """Values (B, ...) of any type where a mask (B,) is set, and others elsewhere."""
+    beside = mask.view(-1, *(1,) * (values.ndim - 1))
+    return torch.where(beside, _signed(values), _signed(others)).view(values.dtype)
+
+
+def _signed(tensor: Tensor) -> Tensor:
+    """The same memory as the signed twin of its type, which has all of torch's operations."""
+    return tensor.view(_SIGNED.get(tensor.dtype, tensor.dtype))
+
+
+def torch_dtype(dtype: np.dtype[Any] | type[Any] | None) -> torch.dtype:
+    """Torch's name of a type of numbers."""
+    return torch.from_numpy(np.empty(0, dtype)).dtype
 
 
 def frames_differ(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 from torch.nn import functional as F
@@ -80,7 +78,7 @@ class SAC(OffPolicyAlgorithm):
     def _explore(self, observations: Observations, features: FrameFeatures) -> Tensor:
         return self._sample(observations, features.actor)[0]
 
-    def _improve_critic(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
+    def _improve_critic(self, indices: Tensor) -> dict[str, Tensor]:
         """Optimizer step on the mean of (Q_i(s, a) - y)^2, summed over both critics (eq. 5)."""
         targets = self._targets(indices)
         observations = self._augment(self._buffer.observations(indices, self.policy.critic_sees))
@@ -90,7 +88,7 @@ class SAC(OffPolicyAlgorithm):
         return {"Losses/Value Loss": loss}
 
     @torch.no_grad()
-    def _targets(self, indices: NDArray[np.int64]) -> Tensor:
+    def _targets(self, indices: Tensor) -> Tensor:
         """Y = R + gamma^k (min_i Q'_i(s', a') - alpha log pi(a'|s')), (B,)."""
         hyper = self._hyperparameters
         returns, discounts, last = self._buffer.returns(indices, hyper.gamma, hyper.n_step)
@@ -99,7 +97,7 @@ class SAC(OffPolicyAlgorithm):
         values = self.policy.value(observations, actions, target=True).amin(dim=0)
         return returns + discounts * (values - self.policy.log_alpha.exp() * log_probs)
 
-    def _improve_actor(self, indices: NDArray[np.int64]) -> dict[str, Tensor]:
+    def _improve_actor(self, indices: Tensor) -> dict[str, Tensor]:
         """Optimizer steps: mean of alpha log pi(a|s) - min_i Q_i(s, a) (eq. 9), then alpha."""
         alpha = self.policy.log_alpha.detach().exp()
         observations = self._augment(self._buffer.observations(indices, self._seen))

@@ -6,7 +6,13 @@ import pytest
 import torch
 from torch import nn
 
-from trainers.algorithms.optimization import load_optimizer, optimizer_step
+from trainers.algorithms.optimization import (
+    adam,
+    check_finite,
+    load_optimizer,
+    optimizer_step,
+    set_learning_rates,
+)
 from trainers.common.errors import NonFiniteError
 
 INFINITE = float("inf")
@@ -15,7 +21,7 @@ INFINITE = float("inf")
 def stepped(slope: float, most: float) -> float:
     """How far a step of plain descent with rate 1 moves a weight whose loss has this slope."""
     weight = nn.Parameter(torch.zeros(()))
-    optimizer_step(torch.optim.SGD([weight], lr=1.0), slope * weight, [weight], most, 7)
+    optimizer_step(torch.optim.SGD([weight], lr=1.0, fused=True), slope * weight, [weight], most)
     return weight.item()
 
 
@@ -26,7 +32,7 @@ def test_a_step_goes_down_the_gradient_and_no_further_than_its_norm_may_be() -> 
 
 def test_other_parameters_get_no_gradient() -> None:
     own, other = nn.Parameter(torch.ones(())), nn.Parameter(torch.ones(()))
-    optimizer_step(torch.optim.SGD([own], lr=1.0), own * other, [own], INFINITE, 7)
+    optimizer_step(torch.optim.SGD([own], lr=1.0, fused=True), own * other, [own], INFINITE)
     assert (own.item(), other.item()) == (0.0, 1.0)
     assert other.grad is None
 
@@ -34,7 +40,8 @@ def test_other_parameters_get_no_gradient() -> None:
 def test_frozen_parameters_stay_as_they_are() -> None:
     learned, frozen = nn.Parameter(torch.ones(())), nn.Parameter(torch.ones(()), False)
     parameters = [frozen, learned]
-    optimizer_step(torch.optim.SGD(parameters, 1.0), 3.0 * learned * frozen, parameters, 0.5, 7)
+    optimizer = torch.optim.SGD(parameters, 1.0, fused=True)
+    optimizer_step(optimizer, 3.0 * learned * frozen, parameters, 0.5)
     assert (learned.item(), frozen.item()) == (pytest.approx(0.5, rel=1e-4), 1.0)
 
 
@@ -42,21 +49,28 @@ def test_frozen_parameters_stay_as_they_are() -> None:
 def test_what_is_not_finite_changes_nothing(scale: float) -> None:
     """The last one's loss is finite, its gradient's norm is not."""
     weight = nn.Parameter(torch.full((), 1e-25))
-    with pytest.raises(NonFiniteError, match=r"^step 7: the loss is .*, its gradient's norm"):
-        optimizer_step(torch.optim.SGD([weight], lr=1.0), weight * scale * 1e9, [weight], 1.0, 7)
+    optimizer = adam([[weight]], torch.device("cpu"))
+    set_learning_rates(optimizer, [1.0])
+    step = optimizer_step(optimizer, weight * scale * 1e9, [weight], 1.0).tolist()
     assert weight.item() == pytest.approx(1e-25)
+    with pytest.raises(NonFiniteError, match=r"^step 7: the loss is .*, its gradient's norm"):
+        check_finite(step, 7)
+    loss, norm = optimizer_step(optimizer, 2.0 * weight, [weight], 1.0).tolist()
+    check_finite((loss, norm), 7)
+    assert (weight.item(), norm) == (pytest.approx(-1.0), 2.0)
 
 
 def test_what_the_loss_does_not_know_stays_as_it_is() -> None:
     known, unknown = nn.Parameter(torch.ones(())), nn.Parameter(torch.ones(()))
-    optimizer = torch.optim.Adam([known, unknown], lr=0.1)
+    optimizer = adam([[known, unknown]], torch.device("cpu"))
+    set_learning_rates(optimizer, [0.1])
     for _ in range(2):  # the second time, too, when it could have a gradient of the first
-        optimizer_step(optimizer, 2.0 * known, [known, unknown], INFINITE, 7)
+        optimizer_step(optimizer, 2.0 * known, [known, unknown], INFINITE)
     assert known.item() == pytest.approx(0.8)
     assert (unknown.item(), unknown.grad) == (1.0, None)
 
 
-def adam(*shape: int) -> torch.optim.Adam:
+def stepped_adam(*shape: int) -> torch.optim.Adam:
     """An optimizer that took one step."""
     parameter = nn.Parameter(torch.zeros(shape))
     parameter.grad = torch.ones(shape)
@@ -66,15 +80,15 @@ def adam(*shape: int) -> torch.optim.Adam:
 
 
 def test_an_optimizer_goes_back_to_its_own_state_alone() -> None:
-    state = adam(2).state_dict()
-    load_optimizer(other := adam(2), state)
+    state = stepped_adam(2).state_dict()
+    load_optimizer(other := stepped_adam(2), state)
     assert other.state_dict()["state"][0]["exp_avg"].tolist() == pytest.approx([0.1, 0.1])
     with pytest.raises(ValueError, match=r"state of a parameter \(\(3,\), torch.float32\) has"):
-        load_optimizer(adam(3), state)
+        load_optimizer(stepped_adam(3), state)
     del state["state"][0]["exp_avg"]
     with pytest.raises(ValueError, match=r"has \{'step'"):
-        load_optimizer(adam(2), state)
-    state = adam(2).state_dict()
+        load_optimizer(stepped_adam(2), state)
+    state = stepped_adam(2).state_dict()
     del state["param_groups"][0]["betas"]
     with pytest.raises(ValueError, match="the optimizer's state has no betas"):
-        load_optimizer(adam(2), state)
+        load_optimizer(stepped_adam(2), state)

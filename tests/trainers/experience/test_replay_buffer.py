@@ -65,10 +65,8 @@ def raw(seen: list[Seen]) -> dict[str, np.ndarray]:
 
 
 def as_seen(observations: Observations) -> list[Seen]:
-    index = observations.frame_index
-    assert index is not None
-    depth = observations.frames["depth"].numpy()[index.numpy()]
-    height = observations.frames["height"].numpy()[index.numpy()]
+    assert observations.frame_index is None
+    depth, height = observations.frames["depth"].numpy(), observations.frames["height"].numpy()
     assert (depth == height - 7).all()
     state = observations.vectors["state"].numpy()
     assert (state[:, 0] == -state[:, 1]).all()
@@ -135,10 +133,10 @@ def n_step(history: list[Kept], first: int, gamma: float, steps: int) -> tuple[f
     return total, 0.0 if one.terminated else gamma**power, one
 
 
-def places_of(buffer: ReplayBuffer) -> np.ndarray:
+def places_of(buffer: ReplayBuffer) -> torch.Tensor:
     """Every place that can be drawn, found by drawing; in order of age after a full ring."""
     generator = torch.Generator().manual_seed(0)
-    return np.unique(buffer.sample(60 * len(buffer), generator))
+    return buffer.sample((60 * len(buffer),), generator).unique()
 
 
 def check(buffer: ReplayBuffer, world: World, gamma: float, steps: int) -> None:
@@ -202,9 +200,9 @@ def test_only_what_is_asked_for_is_fetched() -> None:
     for event in ("moves", "truncated"):
         world.step(buffer, [event])
     for fetch in (buffer.observations, buffer.next_observations):
-        part = fetch(np.array([1]), ["state"])
+        part = fetch(torch.tensor([1]), ["state"])
         assert (set(part.vectors), part.frames, part.frame_index) == ({"state"}, {}, None)
-        part = fetch(np.array([1]), ["height"])
+        part = fetch(torch.tensor([1]), ["height"])
         assert (part.vectors, set(part.frames)) == ({}, {"height"})
 
 
@@ -212,8 +210,8 @@ def test_transitions_are_drawn_alike_wherever_they_lie_in_the_ring() -> None:
     world, buffer = World(2, 3), ReplayBuffer(SPACE, 1, 2, 6, CPU)
     for _ in range(8):
         world.step(buffer, ["moves", "moves"])
-    drawn = buffer.sample(6_000, torch.Generator().manual_seed(1))
-    counts = np.unique(drawn, return_counts=True)[1]
+    drawn = buffer.sample((2_000, 3), torch.Generator().manual_seed(1))
+    counts = np.unique(drawn.numpy(), return_counts=True)[1]
     assert len(counts) == 6
     # Chi squared with 5 degrees of freedom: over 20.5 once in a thousand seeds.
     assert ((counts - 1_000) ** 2 / 1_000).sum() < 20.5
@@ -244,7 +242,7 @@ def line_of(
 
 def estimates(buffer: ReplayBuffer, steps: int) -> list[tuple[float, float, float]]:
     """Return, discount and where the return leads to, of every transition, with gamma 0.5."""
-    returns, discounts, last = buffer.returns(np.arange(len(buffer)), 0.5, steps)
+    returns, discounts, last = buffer.returns(torch.arange(len(buffer)), 0.5, steps)
     x = buffer.next_observations(last, ["x"]).vectors["x"][:, 0]
     return list(zip(returns.tolist(), discounts.tolist(), x.tolist(), strict=True))
 
@@ -278,7 +276,7 @@ def test_environments_do_not_see_each_others_rewards() -> None:
         )
         x = np.array([[number], [10.0 + number]], np.float32)
         buffer.add({"x": x}, np.zeros((2, 1), np.float32), step, {"x": x + 1})
-    returns, _, last = buffer.returns(np.arange(2), 1.0, 3)
+    returns, _, last = buffer.returns(torch.arange(2), 1.0, 3)
     assert returns.tolist() == [3.0, 300.0]
     assert buffer.next_observations(last, ["x"]).vectors["x"][:, 0].tolist() == [3.0, 13.0]
 
@@ -323,7 +321,7 @@ def test_vectors_keep_their_type_and_images_are_not_looked_for() -> None:
         Step(np.zeros(1), nothing, nothing, nothing, None),
         {"x": x},
     )
-    observations = buffer.observations(np.array([0, 0]), ["x"])
+    observations = buffer.observations(torch.tensor([0, 0]), ["x"])
     assert observations.vectors["x"].dtype == torch.float64
     assert observations.frames == {}
     assert observations.frame_index is None
@@ -341,7 +339,7 @@ def test_what_was_added_is_not_changed_when_the_environment_writes_over_it() -> 
     )
     for array in shown.values():
         array[:] = 0
-    assert as_seen(buffer.observations(np.array([0]), NAMES)) == [Seen(1, 2)]
+    assert as_seen(buffer.observations(torch.tensor([0]), NAMES)) == [Seen(1, 2)]
 
 
 def test_a_state_is_no_copy() -> None:
