@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import chain
+from typing import Any
 
 import torch
 from pydantic import Field
@@ -22,8 +24,12 @@ from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Distribution
 from trainers.networks.factory import NetworkFactory
 
+MOST_CHANGE = 1.2
+"""Of the learning rate from one update to the next, as a factor."""
+
+KL = "Policy/KL"
 STATISTICS = (
-    "Policy/KL",
+    KL,
     "Policy/Clip Fraction",
     "Losses/Policy Loss",
     "Losses/Value Loss",
@@ -45,6 +51,13 @@ class PPOHyperparameters(OnPolicyHyperparameters, frozen=True, extra="forbid"):
     kl_penalty: float = Field(0.0, ge=0.0, description="Weight of a penalty on KL(old || new).")
     target_kl: float | None = Field(
         None, gt=0.0, description="Ends an update once the mean KL(old || new) is over this."
+    )
+    desired_kl: float | None = Field(
+        None,
+        gt=0.0,
+        description="The policy's learning rate is scaled from update to update so that the mean "
+        "KL(old || new) of an update stays near this: the smaller the deviation of the actions, "
+        "the smaller the steps that move it as far. null: the rate is as scheduled.",
     )
     value_coefficient: float = Field(0.5, gt=0.0, description="Weight of the value loss.")
     value_clipping: float | None = Field(
@@ -94,11 +107,21 @@ class PPO(OnPolicyAlgorithm):
         if settings.hyperparameters.critic_learning_rate is not None:
             groups = (actor, critic)
         super().__init__(policy, groups, settings.hyperparameters, env_runner, generator, device)
+        self._rate_scale = 1.0  # of the policy's learning rate
 
     @staticmethod
     def build_policy(factory: NetworkFactory, settings: PPOSettings) -> ActorCritic:
         """See `Algorithm.build_policy`."""
         return ActorCritic(factory, settings.network_settings)
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Algorithm.state_dict`."""
+        return {**super().state_dict(), "rate_scale": self._rate_scale}
+
+    def load_state_dict(self, weights: dict[str, Tensor], state: dict[str, Any]) -> None:
+        """See `Algorithm.load_state_dict`."""
+        super().load_state_dict(weights, state)
+        self._rate_scale = state.get("rate_scale", 1.0)  # not in those of former versions
 
     def update(self, run_fraction: float) -> Mapping[str, float]:
         """See `Algorithm.update`."""
@@ -110,8 +133,11 @@ class PPO(OnPolicyAlgorithm):
             if not self._epoch(rollout, advantages, scheduled, averager):
                 break
         self.policy.update_statistics(rollout.vectors)
+        means = averager.means()
+        if self._hyperparameters.desired_kl is not None:
+            self._rate_scale *= rate_change(means[KL], self._hyperparameters.desired_kl)
         variance = explained_variance(rollout.returns, rollout.values)
-        return averager.pop_means() | {
+        return means | {
             "Policy/Learning Rate": scheduled.learning_rate,
             "Policy/Critic Learning Rate": scheduled.critic_learning_rate,
             "Policy/Epsilon": scheduled.epsilon,
@@ -122,11 +148,11 @@ class PPO(OnPolicyAlgorithm):
     def _schedule(self, run_fraction: float) -> _Scheduled:
         hyper = self._hyperparameters
         rates = hyper.learning_rate_schedule
+        rate = self._rate_scale * rates.value(hyper.learning_rate, run_fraction)
+        critic = hyper.critic_learning_rate
         scheduled = _Scheduled(
-            learning_rate=rates.value(hyper.learning_rate, run_fraction),
-            critic_learning_rate=rates.value(
-                hyper.critic_learning_rate or hyper.learning_rate, run_fraction
-            ),
+            learning_rate=rate,
+            critic_learning_rate=rate if critic is None else rates.value(critic, run_fraction),
             epsilon=hyper.epsilon_schedule.value(hyper.epsilon, run_fraction),
             beta=hyper.beta_schedule.value(hyper.beta, run_fraction),
         )
@@ -173,6 +199,17 @@ class PPO(OnPolicyAlgorithm):
             if hyper.target_kl is not None and kl > hyper.target_kl:
                 return False
         return True
+
+
+def rate_change(divergence: float, desired: float) -> float:
+    """Factor of the learning rate after an update, which brings its KL near the desired one.
+
+    The divergence grows with the square of the steps. It is at most 1.2 either way, so that
+    the noise of one update's divergence moves little (Schulman et al. 2017, section 4, adapts the
+    weight of a penalty alike).
+    """
+    wanted = math.sqrt(desired / max(divergence, desired / 100.0))
+    return min(max(wanted, 1.0 / MOST_CHANGE), MOST_CHANGE)
 
 
 def surrogate_loss(

@@ -41,7 +41,10 @@ class Averager:
         Raises:
             ValueError: there are other counts than sums, or something is no number of its kind.
         """
-        self._sums = {name: float(total) for name, total in state["sums"].items()}
-        self._counts = {name: int(state["counts"][name]) for name in self._sums}
+        sums, counts = state["sums"], state["counts"]
+        if any(isinstance(number, bool) for number in (*sums.values(), *counts.values())):
+            raise ValueError(f"sums {sums} and counts {counts} that are no numbers")
+        self._sums = {name: float(total) for name, total in sums.items()}
+        self._counts = {name: int(counts[name]) for name in self._sums}
         if any(count < 1 for count in self._counts.values()):
             raise ValueError(f"counts that are not positive: {self._counts}")

@@ -23,6 +23,7 @@ from trainers.algorithms.ppo import (
     PPOHyperparameters,
     PPOSettings,
     clipped_value_loss,
+    rate_change,
     surrogate_loss,
 )
 from trainers.common.errors import NonFiniteError, UserError
@@ -115,7 +116,36 @@ def test_values_that_moved_far_enough_are_pushed_no_further() -> None:
     assert values.grad[1] == pytest.approx(1.2 - 9.0)
 
 
+def test_the_rate_changes_by_the_root_of_the_divergence_and_little_at_a_time() -> None:
+    # steps of sqrt(0.02 / 0.0225) = 0.943 of their size diverge by 0.02
+    assert rate_change(0.0225, 0.02) == pytest.approx(math.sqrt(8.0) / 3.0)
+    assert rate_change(0.0, 0.02) == pytest.approx(1.2)
+    assert rate_change(9.0, 0.02) == pytest.approx(1 / 1.2)
+
+
 # -- settings ------------------------------------------------------------------------------------
+
+
+def test_a_desired_divergence_scales_the_policys_rate_alone(make_ppo: MakePPO) -> None:
+    hyper = {**CONSTANT, "learning_rate": 1e-3, "critic_learning_rate": 2e-3, "desired_kl": 1e-9}
+    algorithm = make_ppo("target", hyper, SEPARATE)
+    rates = []
+    for _ in range(3):
+        statistics, _ = one_round(algorithm)
+        rates.append(statistics["Policy/Learning Rate"])
+        assert statistics["Policy/Critic Learning Rate"] == 2e-3
+    assert rates == pytest.approx([1e-3, 1e-3 / 1.2, 1e-3 / 1.44])
+    other = make_ppo("target", hyper, SEPARATE)
+    other.load_state_dict(algorithm.policy.state_dict(), algorithm.state_dict())
+    assert one_round(other)[0]["Policy/Learning Rate"] == pytest.approx(1e-3 / 1.2**3)
+
+
+def test_divergence_comes_near_what_is_desired(make_ppo: MakePPO) -> None:
+    hyper = {**CONSTANT, "learning_rate": 1e-5, "num_epoch": 4, "desired_kl": 0.01}
+    algorithm = make_ppo("target", hyper)
+    divergences = [one_round(algorithm)[0]["Policy/KL"] for _ in range(80)]
+    assert divergences[0] < 1e-3
+    assert 0.005 < sum(divergences[-20:]) / 20 < 0.02
 
 
 @dataclass
