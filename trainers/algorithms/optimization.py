@@ -85,6 +85,9 @@ def load_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> N
         {name: value for name, value in group.items() if name != "params"}
         for group in optimizer.param_groups
     ]
+    for moments in state["state"].values():  # of which torch makes tensors itself
+        if strange := [name for name, each in moments.items() if not isinstance(each, Tensor)]:
+            raise ValueError(f"the optimizer's state has {', '.join(strange)} that are no tensors")
     optimizer.load_state_dict(state)
     for known, group in zip(settings, optimizer.param_groups, strict=True):
         if missing := known.keys() - group.keys():

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
+
+
+MOST = 2**53
+"""Counts from here on are no exact floating-point numbers."""
 
 
 class Averager:
@@ -42,9 +47,8 @@ class Averager:
             ValueError: there are other counts than sums, or something is no number of its kind.
         """
         sums, counts = state["sums"], state["counts"]
-        if any(isinstance(number, bool) for number in (*sums.values(), *counts.values())):
-            raise ValueError(f"sums {sums} and counts {counts} that are no numbers")
-        self._sums = {name: float(total) for name, total in sums.items()}
-        self._counts = {name: int(counts[name]) for name in self._sums}
-        if any(count < 1 for count in self._counts.values()):
-            raise ValueError(f"counts that are not positive: {self._counts}")
+        if not all(type(total) is float and math.isfinite(total) for total in sums.values()):
+            raise ValueError(f"sums that are no finite numbers: {sums}")
+        if not all(type(counts[name]) is int and 1 <= counts[name] < MOST for name in sums):
+            raise ValueError(f"counts that are none: {counts}")
+        self._sums, self._counts = dict(sums), {name: counts[name] for name in sums}
