@@ -59,6 +59,7 @@ class PPOHyperparameters(OnPolicyHyperparameters, frozen=True, extra="forbid"):
         "KL(old || new) of an update stays near this: the smaller the deviation of the actions, "
         "the smaller the steps that move it as far. null: the rate is as scheduled.",
     )
+    desired_kl_schedule: Schedule = Field(CONSTANT, description="Course of desired_kl.")
     value_coefficient: float = Field(0.5, gt=0.0, description="Weight of the value loss.")
     value_clipping: float | None = Field(
         None, gt=0.0, description="How far a value may move in an update; null: anywhere."
@@ -133,9 +134,10 @@ class PPO(OnPolicyAlgorithm):
             if not self._epoch(rollout, advantages, scheduled, averager):
                 break
         self.policy.update_statistics(rollout.vectors)
-        means = averager.means()
-        if self._hyperparameters.desired_kl is not None:
-            self._rate_scale *= rate_change(means[KL], self._hyperparameters.desired_kl)
+        means, hyper = averager.means(), self._hyperparameters
+        if hyper.desired_kl is not None:
+            desired = hyper.desired_kl_schedule.value(hyper.desired_kl, run_fraction)
+            self._rate_scale *= rate_change(means[KL], desired)
         variance = explained_variance(rollout.returns, rollout.values)
         return means | {
             "Policy/Learning Rate": scheduled.learning_rate,

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-
 MOST = 2**53
 """Counts from here on are no exact floating-point numbers."""
 
