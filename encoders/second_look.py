@@ -79,6 +79,18 @@ class SecondLook(PointEncoder):
         query_units: Size = Field(
             64, description="Units of the layer that turns the first look into queries."
         )
+        logit_cap: float | None = Field(
+            None,
+            gt=0.0,
+            description="Logits of the second look's attention are bent to stay within this: "
+            "cap * tanh(logit / cap). Without it a map may harden on one patch, where it has no "
+            "gradient any more. null: as they are.",
+        )
+        normalize_queries: bool = Field(
+            False,
+            description="Standardise each image's features of the first look before queries are "
+            "computed from them.",
+        )
         precision: Literal["float32", "bfloat16"] = Field(
             "float32",
             description="Numbers that patches are described with; bfloat16 is faster where the "
@@ -123,10 +135,15 @@ class SecondLook(PointEncoder):
             logits = described @ described_queries
         with torch.autocast(raw.device.type, enabled=False):
             places = torch.cat([points, squares / COORDINATES], dim=-1) @ place_queries
-            attention = _weights(logits.float() + places, unseen)
+            attention = _weights(self._capped(logits.float() + places), unseen)
             return torch.cat(
                 [first, attended(attention, points, squares, second_values.float())], dim=1
             )
+
+    def _capped(self, logits: torch.Tensor) -> torch.Tensor:
+        """Logit soft-capping (Gemma Team 2024, arXiv:2408.00118, section 2)."""
+        cap = self._settings.logit_cap
+        return logits if cap is None else cap * torch.tanh(logits / cap)
 
     def _look(self, depth_m: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Depths (B, H, W) -> shapes (B, n, 3 * p * p), middles (B, n, 3), unseen (B, n, 1)."""
@@ -161,6 +178,7 @@ class Queries(nn.Module):
         super().__init__()
         self._sizes = [settings.hidden_units, COORDINATES + MOMENTS]
         units, maps = settings.query_units, settings.second_keypoints
+        self.standard = nn.LayerNorm(features_dim) if settings.normalize_queries else nn.Identity()
         self.hidden = dense(features_dim, units, "relu")
         self.out = nn.Linear(units, maps * sum(self._sizes))
         # At the start images hardly differ in their queries, and maps do.
@@ -169,7 +187,9 @@ class Queries(nn.Module):
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Queries of what describes a patch (B, hidden units, K) and of its place (B, 9, K)."""
-        queries = self.out(self.hidden(features)).unflatten(1, (-1, sum(self._sizes)))
+        queries = self.out(self.hidden(self.standard(features))).unflatten(
+            1, (-1, sum(self._sizes))
+        )
         described, place = queries.transpose(1, 2).split(self._sizes, dim=1)
         return described, place
 

@@ -111,6 +111,25 @@ def test_where_the_second_look_goes_depends_on_what_the_first_one_found():
     assert not torch.allclose(queries[0], queries[2])
 
 
+def test_capped_logits_leave_every_patch_some_attention():
+    encoder = make(logit_cap=2.0)
+    capped = encoder._capped(torch.tensor([-1e3, 0.0, 0.01, 1e3]))
+    assert capped.tolist() == pytest.approx([-2.0, 0.0, 0.01, 2.0], rel=1e-4)
+    for layer in (encoder.queries.out.weight, encoder.queries.out.bias):
+        layer.data *= 1e4
+    points = middles(slanted()).reshape(-1, 3)
+    mean, _ = places(encoder(raw(slanted())))[2:]
+    furthest = (points.max(axis=0) - points.min(axis=0)) / 2
+    assert (abs(mean[0] - points.mean(axis=0)) < furthest).all()  # no corner alone
+
+
+def test_standardised_queries_do_not_depend_on_the_scale_of_features():
+    queries = make(normalize_queries=True).queries
+    features = torch.randn(2, FIRST * (9 + VALUES))
+    for one, other in zip(queries(features), queries(3.0 * features + 1.0), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
+
+
 def test_what_was_not_seen_gets_no_attention():
     depth_m = slanted()
     depth_m[:, 36:] = np.inf
