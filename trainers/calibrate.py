@@ -5,12 +5,19 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from pathlib import Path
+from typing import TYPE_CHECKING
 
-from trainers.calibration import calibrate
 from trainers.common.command import DONE, tells_failures
-from trainers.evaluate import add_trust_option, positive, seed_number
-from trainers.inference.confidence import NEVER, Card, Measured
+from trainers.common.options import (
+    add_results_option,
+    add_trust_option,
+    command_parser,
+    positive,
+    seed_number,
+)
+
+if TYPE_CHECKING:
+    from trainers.inference.confidence import Card, Measured
 
 EPISODES = 80_000
 
@@ -19,6 +26,9 @@ EPISODES = 80_000
 def main(arguments: Sequence[str] | None = None) -> int:
     """Calibrates a policy; returns the exit code."""
     options = parse(arguments)
+    # Imported late, so that `--help` answers at once.
+    from trainers.deployment.calibration import calibrate  # noqa: PLC0415
+
     path, card = calibrate(
         options.policy,
         episodes=options.episodes,
@@ -33,27 +43,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Reads the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m trainers.calibrate",
+    parser = command_parser(
+        "python -m trainers.calibrate",
         description="Learn how sure a trained policy is of its first actions, from episodes never "
         "used for training, and store that beside its weights.",
     )
     parser.add_argument(
         "policy", help="a run (its best checkpoint), a checkpoint's or an exported folder"
     )
-    parser.add_argument(
-        "--episodes", type=positive, default=EPISODES, help="how many (default: %(default)s)"
-    )
+    parser.add_argument("--episodes", type=positive, default=EPISODES, help="how many")
     parser.add_argument("--seed", type=seed_number, default=0, help="of the episodes")
     add_trust_option(parser)
-    parser.add_argument(
-        "--results-dir", type=Path, default=Path("results"), help="where runs are kept"
-    )
+    add_results_option(parser)
     return parser.parse_args(arguments)
 
 
 def told(card: Card) -> Iterator[str]:
     """What a card says, in lines."""
+    from trainers.inference.confidence import NEVER  # noqa: PLC0415
+
     limits = ", ".join(error.shown(error.limit) for error in card.errors)
     yield f"right is at most: {limits}"
     if card.threshold == NEVER:

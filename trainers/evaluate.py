@@ -8,18 +8,25 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.table import Table
-
-from envs.evaluation import EvaluationOption, Figure, RunFileOption
 from trainers.common.command import DONE, tells_failures
 from trainers.common.errors import UserError, suggestion
 from trainers.common.files import write_atomically
-from trainers.evaluation import SEED_LIMIT, Evaluation, evaluate, find_run
-from trainers.reporting.figures import figure_values
-from trainers.runfile.settings import Component
+from trainers.common.options import (
+    add_results_option,
+    add_trust_option,
+    command_parser,
+    positive,
+    seed_number,
+)
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from envs.evaluation import EvaluationOption
+    from trainers.evaluation import Evaluation
+    from trainers.runfile.settings import Component
 
 PROGRAM = "python -m trainers.evaluate"
 
@@ -28,6 +35,11 @@ PROGRAM = "python -m trainers.evaluate"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluates a policy; returns the exit code."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
+    # Imported late, as below, so that `--help` answers at once.
+    from rich.console import Console  # noqa: PLC0415
+
+    from trainers.evaluation import evaluate  # noqa: PLC0415
+
     evaluation = evaluate(
         options.policy,
         episodes=options.episodes,
@@ -63,8 +75,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         with _policy_first(rest[0]):
             environment = _environment(policy, known)
     offered = () if environment is None else environment.cls.evaluation_options
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
+    parser = command_parser(
+        PROGRAM,
         description="Report how good a policy is, in episodes never used for training.",
         parents=[generic],
         epilog=None if policy else "POLICY --help lists the options of its environment, too.",
@@ -103,19 +115,8 @@ def _generic_options() -> argparse.ArgumentParser:
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here, too")
     add_trust_option(parser)
-    parser.add_argument(
-        "--results-dir", type=Path, default=Path("results"), help="where runs are kept"
-    )
+    add_results_option(parser)
     return parser
-
-
-def add_trust_option(parser: argparse.ArgumentParser) -> None:
-    """Adds the option with which a policy's environment may import what its run file names."""
-    parser.add_argument(
-        "--trust",
-        action="store_true",
-        help="import the modules that the policy's environment names, as in id: MODULE:ID",
-    )
 
 
 @contextmanager
@@ -133,12 +134,16 @@ def _policy_first(word: str) -> Iterator[None]:
 
 
 def _environment(policy: str, known: argparse.Namespace) -> Component:
+    from trainers.evaluation import find_run  # noqa: PLC0415
+
     _, run = find_run(policy, (), known.results_dir, trust=known.trust)
     return run.environment
 
 
 def _add_options(parser: argparse.ArgumentParser, environment: Component) -> None:
     """Adds what an environment offers."""
+    from envs.evaluation import RunFileOption  # noqa: PLC0415
+
     group = parser.add_argument_group(f"options of the environment {environment.name!r}")
     for option in environment.cls.evaluation_options:
         takes: dict[str, Any] = {"action": "store_true"}
@@ -159,6 +164,8 @@ def _resolved(
     options: argparse.Namespace, offered: Sequence[EvaluationOption]
 ) -> argparse.Namespace:
     """The options, with what those of the environment mean in the place of them."""
+    from envs.evaluation import RunFileOption  # noqa: PLC0415
+
     options.check = options.window = False
     for option in offered:
         given = vars(options)[option.flag]
@@ -185,6 +192,11 @@ def _refuse(unknown: Sequence[str], flags: Sequence[str]) -> None:
 
 def table(name: str, evaluation: Evaluation) -> Table:
     """The figures for people."""
+    from rich.table import Table  # noqa: PLC0415
+
+    from envs.evaluation import Figure  # noqa: PLC0415
+    from trainers.reporting.figures import figure_values  # noqa: PLC0415
+
     report = evaluation.report
     result = Table(title=f"{name}: {report['episodes']} episodes, seed {report['seed']}")
     result.add_column("figure")
@@ -202,37 +214,6 @@ def _write(path: Path, report: dict[str, Any]) -> None:
         write_atomically(path, json.dumps(report, indent=2) + "\n")
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}") from error
-
-
-def positive(text: str) -> int:
-    """A command line's count.
-
-    Raises:
-        argparse.ArgumentTypeError: it is none.
-    """
-    return _whole_number(text, 1)
-
-
-def seed_number(text: str) -> int:
-    """A command line's seed of episodes.
-
-    Raises:
-        argparse.ArgumentTypeError: it is none.
-    """
-    return _whole_number(text, 0)
-
-
-def _whole_number(text: str, least: int) -> int:
-    """Raises: argparse.ArgumentTypeError: it is none, or not within its limits."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = least - 1
-    if not least <= value < SEED_LIMIT:
-        raise argparse.ArgumentTypeError(
-            f"should be a whole number from {least} to {SEED_LIMIT - 1}, not {text!r}"
-        )
-    return value
 
 
 if __name__ == "__main__":

@@ -42,8 +42,7 @@ from trainers.session import blaming_parameters, build_environment, final_parame
 
 # Run files take seeds below this, so that no run was ever trained on an evaluation's episodes.
 FIRST_SEED = 2**32
-SEED_LIMIT = 2**31
-"""Seeds of evaluations are below it: each has two of the numbers from `FIRST_SEED` on."""
+"""Each of the seeds up to `SEED_LIMIT` has two of the numbers from here on."""
 SEEDS_PER_BATCH = 2 * FIRST_SEED
 """From one batch of first actions to the next; runs and other evaluations have none of them."""
 FIRST_ACTION, WHOLE_EPISODE = 0, 1

@@ -15,6 +15,7 @@ from typing import Any
 from trainers.common import process, stopping
 from trainers.common.command import DONE, INTERRUPTED, TERMINATED, tells_failures
 from trainers.common.errors import UserError
+from trainers.common.options import add_results_option, command_parser
 from trainers.common.origin import PACKAGES
 
 
@@ -38,9 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Reads the command line; argparse itself exits with 2 on a mistake."""
-    parser = argparse.ArgumentParser(
-        prog="python -m trainers.learn", description="Train as a run file says."
-    )
+    parser = command_parser("python -m trainers.learn", description="Train as a run file says.")
     parser.add_argument("config", type=Path, help="the run file")
     parser.add_argument(
         "overrides",
@@ -59,9 +58,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, help="overrides `seed`")
     parser.add_argument("--num-envs", type=int, help="overrides `environment.num_envs`")
     parser.add_argument("--device", help="overrides `device`, such as cpu or cuda")
-    parser.add_argument(
-        "--results-dir", type=Path, default=Path("results"), help="where runs are kept"
-    )
+    add_results_option(parser)
     options = parser.parse_intermixed_args(arguments)
     if options.resume and options.initialize_from:
         parser.error("--resume goes on with the run's own weights: leave --initialize-from out")

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
 
-from rich.console import Console
-
 from trainers.common.command import DONE, tells_failures
-from trainers.runfile.listing import component_rows, print_plain, print_tables
-from trainers.runfile.registry import load_registries
+from trainers.common.options import command_parser
 
 
 @tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
-    """List the components; returns the exit code, 2 when a plugin is broken."""
-    parser = argparse.ArgumentParser(prog="python -m trainers.plugins", description=main.__doc__)
+    """Lists the components with their settings; returns the exit code."""
+    parser = command_parser("python -m trainers.plugins", description=main.__doc__)
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args(arguments)
+    # Imported late, so that `--help` answers at once.
+    from rich.console import Console  # noqa: PLC0415
+
+    from trainers.runfile.listing import (  # noqa: PLC0415
+        component_rows,
+        print_plain,
+        print_tables,
+    )
+    from trainers.runfile.registry import load_registries  # noqa: PLC0415
+
     rows = component_rows(load_registries())
     console = Console()
     if options.json:

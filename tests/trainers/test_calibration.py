@@ -13,14 +13,14 @@ import pytest
 import torch
 
 from envs.evaluation import Evaluator
-from trainers import calibration
 from trainers.calibrate import main
-from trainers.calibration import FIRST_SEED
 from trainers.common.command import DONE, MISTAKE
 from trainers.common.errors import UserError
+from trainers.common.options import SEED_LIMIT
+from trainers.deployment import calibration
+from trainers.deployment.calibration import FIRST_SEED
 from trainers.evaluation import FIRST_SEED as FIRST_EVALUATED
 from trainers.evaluation import (
-    SEED_LIMIT,
     SEEDS_PER_BATCH,
     RecordedPolicy,
     evaluate,

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 import yaml
 
-from trainers import compare
 from trainers.common.command import DONE, MISTAKE
-from trainers.compare import main
+from trainers.compare import main, parse_options
+from trainers.comparison.planning import PlannedRun, plan
 from trainers.runfile.registry import load_registries
 from trainers.saving.run_folder import CONFIGURATION
 
@@ -36,12 +36,12 @@ def config(tmp_path: Path) -> Path:
     return path
 
 
-def planned(config: Path, results: Path, **options: Any) -> list[compare.PlannedRun]:
+def planned(config: Path, results: Path, **options: Any) -> list[PlannedRun]:
     words = [str(config), "--results-dir", str(results)]
     for name, value in options.items():
         words += [f"--{name.replace('_', '-')}", str(value)]
-    parsed = compare.parse_options(words)
-    return list(compare.plan(parsed, parsed.paths))
+    parsed = parse_options(words)
+    return list(plan(parsed, parsed.paths))
 
 
 def test_runs_what_is_missing_and_reports_on_all(
@@ -140,4 +140,4 @@ def test_mistakes_are_told_before_any_run_begins(
 def test_counts_are_whole_numbers_from_1(option: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["x.yaml", option, "0"])
-    assert "should be a whole number from 1, not '0'" in capsys.readouterr().err
+    assert "should be a whole number from 1 to 2147483647, not '0'" in capsys.readouterr().err

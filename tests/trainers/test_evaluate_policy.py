@@ -14,8 +14,9 @@ from envs.environment import Environment, EnvironmentFailure
 from envs.evaluation import Evaluator, error, rate
 from trainers import evaluation
 from trainers.common.errors import UserError
+from trainers.common.options import SEED_LIMIT
 from trainers.common.stopping import StopRequested
-from trainers.evaluation import FIRST_SEED, SEED_LIMIT, evaluate_policy
+from trainers.evaluation import FIRST_SEED, evaluate_policy
 
 EPISODES = 3  # the first to begin: two of the first environment's, one of the second's
 REWARD = [[1.0, 10.0], [2.0, 20.0], [3.0, 30.0], [4.0, 40.0], [5.0, 50.0]]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from envs.views import CameraFile
-from trainers.runfile.validation import InvalidError, validate
-from trainers.runfile.yaml_document import Problem, SettingsError, read
+if TYPE_CHECKING:
+    from envs.views import CameraFile
 
 
 def add_camera_options(parser: argparse.ArgumentParser) -> None:
@@ -35,6 +35,11 @@ def read_camera(path: Path | None) -> CameraFile | None:
     """
     if path is None:
         return None
+    # Imported late, so that `--help` answers at once.
+    from envs.views import CameraFile  # noqa: PLC0415
+    from trainers.runfile.validation import InvalidError, validate  # noqa: PLC0415
+    from trainers.runfile.yaml_document import Problem, SettingsError, read  # noqa: PLC0415
+
     document = read(path)
     try:
         return validate(CameraFile, document.data)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from trainers.common.command import DONE, FAILED, require_extra, tells_failures
 from trainers.common.errors import UserError
-from trainers.compare import positive
+from trainers.common.options import command_parser, positive
 from trainers.comparison.jobs import CORES
 from trainers.learn import Stop, stop_on_signals
 
@@ -30,8 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Reads the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m trainers.sweep",
+    parser = command_parser(
+        "python -m trainers.sweep",
         description="Try settings of a run file, and report on which did best.",
     )
     parser.add_argument("sweep", type=Path, metavar="SWEEP", help="the sweep file")

@@ -14,8 +14,8 @@ import optuna
 from optuna.trial import TrialState
 
 from trainers.common.errors import UserError
-from trainers.compare import PlannedRun
 from trainers.comparison.jobs import STOPPED, Ended, run, say
+from trainers.comparison.planning import PlannedRun
 from trainers.comparison.results import Curves, read_status
 from trainers.held_out import BEST_BY
 from trainers.reporting.event_log import RunLog
