@@ -18,10 +18,9 @@ from typing import Any
 import yaml
 from rich.console import Console
 
-from benchmarks.command import require
 from benchmarks.tables import table, write_between
 from envs.grasp.settings import GraspSettings
-from trainers.common.command import tells_failures
+from trainers.common.command import require_extra, tells_failures
 from trainers.common.errors import UserError
 from trainers.comparison.tables import markdown
 from trainers.evaluation import evaluate, find_run
@@ -85,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluates under every fault, and prints the table; returns the exit code."""
     options = parse(arguments)
     if options.plot is not None:
-        require("matplotlib")
+        require_extra("render", "matplotlib")
     cameras = depth_cameras(find_run(options.policy, [], options.results_dir)[1])
     measured = list(measure(options, cameras))
     rows = [row(fault, simulator, report) for fault, simulator, report in measured]

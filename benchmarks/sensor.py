@@ -139,9 +139,8 @@ def frames_per_second(view: dict[str, Any]) -> dict[str, float]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures and prints."""
     options = parse(arguments)
-    columns = {"simulated": simulated(options.frames), "a real one": REAL}
-    if options.frame is not None:
-        columns[options.frame.name] = measure(read(options.frame))
+    own = {} if options.frame is None else {options.frame.name: measure(read(options.frame))}
+    columns = {"simulated": simulated(options.frames), "a real one": REAL, **own}
     rows = [(name, *(f"{found[name]:.2f}" for found in columns.values())) for name in NAMES]
     Console().print(table("frames of 640x480", ("figure", *columns), rows))
     views = {"80x80": {"type": "depth"}, "640x480, every 6th": {**VIEW, "sampling": {"every": 6}}}
@@ -156,9 +155,13 @@ def read(path: Path) -> Frame:
     """A frame from a file.
 
     Raises:
-        UserError: it is no 16-bit PNG of one channel.
+        UserError: it can't be read, or is no 16-bit PNG of one channel.
     """
-    frame = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    try:
+        content = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise UserError(f"{path}: can't be read: {error.strerror}") from error
+    frame = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
     if frame is not None and frame.dtype == np.uint16 and frame.ndim == 2:
         return frame.astype(np.uint16)
     found = "no image" if frame is None else f"{frame.dtype} of shape {frame.shape}"

@@ -15,11 +15,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.command import ROOT, add_options, require
+from benchmarks.command import EXTRA, ROOT, add_options
 from benchmarks.learning.cases import CASES, PLUGINS, SIDES, Entry
 from benchmarks.learning.report import HEAD, draw, rows
 from benchmarks.tables import table, write_between
-from trainers.common.command import tells_failures
+from trainers.common.command import require_extra, tells_failures
 from trainers.common.errors import UserError
 from trainers.comparison.jobs import Job, run_missing
 from trainers.comparison.tables import markdown
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Trains what is missing, and reports on all."""
     options = parse(arguments)
     algorithms = trainable(options.algorithms)
-    require("scipy", "matplotlib")
+    require_extra(EXTRA, "scipy", "matplotlib")
     # Side by side with its peer, so that both meet the same moods of the machine.
     jobs = [
         _job(Entry(case, side, seed), options.results)
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for side in SIDES
     ]
     if not all(job.results.exists() for job in jobs):
-        require("stable_baselines3", "sb3_contrib", "mujoco")
+        require_extra(EXTRA, "stable_baselines3", "sb3_contrib", "mujoco")
     return run_missing(jobs, options.jobs) or report(options, jobs)
 
 

@@ -21,9 +21,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.command import INSTALL, missing, require
+from benchmarks.command import EXTRA, missing
 from trainers.common import process
-from trainers.common.command import tells_failures
+from trainers.common.command import require_extra, tells_failures
 
 PARTS = ("simulator", "environment", "training", "memory", "runs")
 SIZES = (32, 80, 128, 256)
@@ -41,10 +41,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from benchmarks.speed.training import PEER_PACKAGES  # noqa: PLC0415
 
     if options.track is not None:
-        require(*PEER_PACKAGES)
+        require_extra(EXTRA, *PEER_PACKAGES)
         return track(options.track)
     if missing(*PEER_PACKAGES) and {"training", "memory"} & set(options.parts):
-        print(f"stable-baselines3 is not installed, training is measured without it; {INSTALL}")
+        print(
+            "stable_baselines3 is not installed, training is measured without it: pip install "
+            f"'ventosa[{EXTRA}]'"
+        )
     for part in options.parts:
         Console().print(MEASURES[part](options))
     return 0

@@ -75,5 +75,8 @@ def test_what_is_no_depth_frame_is_refused(
         sensor.UserError, match=r"color\.png: uint8 of shape .*expected is a 16-bit"
     ):
         sensor.read(tmp_path / "color.png")
-    with pytest.raises(sensor.UserError, match=r"none\.png: no image"):
+    with pytest.raises(sensor.UserError, match=r"none\.png: can't be read: No such file"):
         sensor.read(tmp_path / "none.png")
+    (tmp_path / "empty.png").touch()
+    with pytest.raises(sensor.UserError, match=r"empty\.png: no image"):
+        sensor.read(tmp_path / "empty.png")

@@ -65,7 +65,7 @@ def test_without_the_extra_the_rest_is_measured(
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     assert speed.main([*TINY, "--parts", "training"]) == 0
     shown = capsys.readouterr().out
-    assert "pip install -c constraints.txt -e '.[bench]'" in shown
+    assert "pip install 'ventosa[bench]'" in shown
     assert "training steps" in shown
     assert "stable-baselines3 │" not in shown
 
