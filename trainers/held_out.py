@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -36,6 +37,7 @@ class HeldOutEvaluation:
 
     Attributes:
         latest: the last report, with the `step` that it is of; empty before the first.
+        took_s: seconds of that evaluation.
         begins_due: whether an evaluation is due at the very step at which the run is taken up.
 
     Raises:
@@ -60,6 +62,7 @@ class HeldOutEvaluation:
         self._env = evaluation_environment(run, settings.episodes)
         self._network = session.algorithm.policy
         self.latest: dict[str, Any] = {}
+        self.took_s = 0.0
         try:
             self._evaluate(start_step)
             self._check_target()
@@ -111,6 +114,7 @@ class HeldOutEvaluation:
 
     def _evaluate(self, step: int) -> None:
         settings, env, network = self._settings, self._env, self._network
+        start_s = time.monotonic()
         # A new one each time: what it draws depends on the seed, not on the evaluations before.
         policy = Policy(
             network, env.single_observation_space, env.single_action_space, settings.seed
@@ -119,6 +123,7 @@ class HeldOutEvaluation:
             report = evaluate_policy(
                 policy, env, settings.episodes, settings.seed, stop_requested=self._stop_requested
             )
+        self.took_s = time.monotonic() - start_s
         self._evaluated_at, self.latest = step, {"step": step, **report}
 
     def _check_target(self) -> None:

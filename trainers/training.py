@@ -199,6 +199,7 @@ class Training:
             return False
         held_out.evaluate(step, self._log)
         self._summary.note_evaluation(held_out.latest)
+        self._summary.pace.note_evaluation(held_out.took_s)
         return True
 
     def _save(self, good: Resumable, *, interval_over: bool = False) -> None:

@@ -18,6 +18,7 @@ from trainers.experience.episodes import EpisodeBatch
 from trainers.experience.frames import frame_spaces
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.images import picture
+from trainers.reporting.pace import Pace
 from trainers.reporting.terminal import RunStatus, TerminalDisplay
 
 REWARD_TAG = "Environment/Cumulative Reward"
@@ -50,6 +51,7 @@ class Summary:
         max_steps: steps of the whole run.
         summary_freq: steps between two summaries.
         start_step: steps the run had when this process took it up.
+        pace: estimates the time left; by default one that knows of no evaluations.
     """
 
     def __init__(
@@ -60,11 +62,13 @@ class Summary:
         max_steps: int,
         summary_freq: int,
         start_step: int = 0,
+        pace: Pace | None = None,
     ):
+        self.pace = pace or Pace(start_step, max_steps)
         self._frame_spaces = frame_spaces(env.single_observation_space)
         self._figures = env.evaluator().figures
         self._log, self._run_id, self._max_steps = log, run_id, max_steps
-        self._summary_freq, self._start_step = summary_freq, start_step
+        self._summary_freq = summary_freq
         self._averager = Averager()
         self._last: dict[str, float] = {}
         self._summaries = 0
@@ -110,10 +114,13 @@ class Summary:
             observations: by name (N, ...), the present ones, of which images are shown at times.
             display: the terminal.
         """
-        if position.step >= self._next_summary:
-            self._next_summary = (position.step // self._summary_freq + 1) * self._summary_freq
-            self._summarize(position, observations)
-            display.update(self._line(position))
+        self.pace.note_step(position.step)
+        if position.step < self._next_summary:
+            display.advance(self._line(position))
+            return
+        self._next_summary = (position.step // self._summary_freq + 1) * self._summary_freq
+        self._summarize(position, observations)
+        display.update(self._line(position))
 
     def note_evaluation(self, report: Mapping[str, Any]) -> None:
         """Keeps the latest evaluation, for status.json."""
@@ -169,17 +176,13 @@ class Summary:
             self._log.images(f"Observations/{name}", picture(space, frame), step)
 
     def _line(self, position: RunPosition) -> RunStatus:
-        step = position.step
-        elapsed_s = time.monotonic() - self._start_s
-        overall = (step - self._start_step) / max(elapsed_s, 1e-9)
-        left_s = (self._max_steps - step) / overall if overall > 0 else None
         return RunStatus(
-            step=step,
+            step=position.step,
             reward=self._last.get(REWARD_TAG),
             lesson=position.lesson or 0,
             success=self._last.get(SUCCESS_TAG),
             steps_per_second=self._last.get("Performance/Steps Per Second"),
-            seconds_left=None if left_s is None else max(left_s, 0.0),
+            seconds_left=self.pace.seconds_left,
         )
 
 

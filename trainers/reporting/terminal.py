@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self
 
+from rich.columns import Columns
 from rich.console import Console, Group
+from rich.control import Control
 from rich.live import Live
 from rich.panel import Panel
 from rich.progress_bar import ProgressBar
+from rich.segment import ControlType
 from rich.table import Table
 from rich.text import Text
 
 _UNKNOWN = "?"
 _LONGEST_TITLE = 50
 _WIDEST_PANEL = 100
+_REDRAWS_PER_S = 2.0
+_ERASED_LINE_UP = ((ControlType.ERASE_IN_LINE, 2), (ControlType.CURSOR_UP, 1))
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,10 @@ class TerminalDisplay(Protocol):
     """Shows a run's progress; used as a context manager around the run."""
 
     def update(self, line: RunStatus) -> None:
-        """Show where the run stands."""
+        """Show where the run stands, after a summary."""
+
+    def advance(self, line: RunStatus) -> None:
+        """Show where it stands between two summaries, where the display is redrawn."""
 
     def message(self, text: str) -> None:
         """Show a line of text that stays; it is printed as it is, without markup."""
@@ -162,16 +171,26 @@ class _PlainDisplay(_BaseDisplay):
         left = f"{_if_known(line.seconds_left, format_duration)} left"
         self.message("  ".join([position, *self._figures(line), left]))
 
+    def advance(self, line: RunStatus) -> None:
+        """Prints nothing."""
+
 
 class _LiveDisplay(_BaseDisplay):
-    """A panel that stays at the foot of the terminal; messages scroll by above it."""
+    """A panel that stays at the foot of the terminal; messages scroll by above it.
+
+    It is redrawn by a thread, so that the time left runs down, and a terminal's new size is taken
+    up, however long an update takes.
+    """
 
     def __init__(
         self, console: Console, run_id: str, max_steps: int, lesson_count: int, start_step: int
     ) -> None:
         super().__init__(console, run_id, max_steps, lesson_count, start_step)
-        first = self._panel(RunStatus(step=start_step))
-        self._live = Live(first, console=console, auto_refresh=False)
+        self._latest = (RunStatus(step=start_step), time.monotonic())
+        self._drawn = (self._panel(0), 0)  # and its width: none that a terminal wraps
+        self._live = Live(
+            console=console, get_renderable=self._redrawn, refresh_per_second=_REDRAWS_PER_S
+        )
 
     def __enter__(self) -> Self:
         self._live.start(refresh=True)
@@ -186,26 +205,45 @@ class _LiveDisplay(_BaseDisplay):
         self._live.stop()
 
     def update(self, line: RunStatus) -> None:
-        """Redraw the panel."""
-        self._live.update(self._panel(line), refresh=True)
+        """Take down what the next panel shows."""
+        self._latest = (line, time.monotonic())
 
-    def _panel(self, line: RunStatus) -> Panel:
-        position = f"{format_count(line.step)} / {format_count(self._max_steps)}"
-        # A run may overshoot by part of its last batch.
-        share = min(1.0, line.step / max(1, self._max_steps))
-        left = f"{_if_known(line.seconds_left, format_duration)} left"
+    advance = update
+
+    def _panel(self, width: int) -> Panel:
+        line, noted_s = self._latest
         bar = Table.grid(padding=(0, 2, 0, 0), expand=True)
         bar.add_column(no_wrap=True)
         bar.add_column(ratio=1)
         bar.add_column(no_wrap=True)
         bar.add_column(no_wrap=True)
+        position = f"{format_count(line.step)} / {format_count(self._max_steps)}"
+        # A run may overshoot by part of its last batch.
+        share = min(1.0, line.step / max(1, self._max_steps))
+        left_s = line.seconds_left
+        if left_s is not None:
+            left_s = max(left_s - (time.monotonic() - noted_s), 0.0)
+        left = f"{_if_known(left_s, format_duration)} left"
         bar.add_row(position, ProgressBar(total=1.0, completed=share), f"{share:.0%}", left)
-        figures = Text("   ".join(self._figures(line)), no_wrap=True, overflow="ellipsis")
+        figures = Columns(map(Text, self._figures(line)), padding=(0, 3))
         # Text, not str: a run id may hold what rich would take for markup.
         title = Text(self._run_id, style="bold")
         title.truncate(_LONGEST_TITLE, overflow="ellipsis")
-        width = min(self._console.width, _WIDEST_PANEL)
         return Panel(Group(bar, figures), title=title, title_align="left", width=width)
+
+    def _redrawn(self) -> Panel:
+        """The panel of now, in place of the last one."""
+        now_width = self._console.width
+        panel, width = self._drawn
+        if width > now_width:
+            # The terminal wrapped its lines, of which rich erases only as many as it drew.
+            options = self._console.options.update(width=width)
+            rows = len(self._console.render_lines(panel, options))
+            more = rows * ((width - 1) // now_width)
+            self._console.control(Control(*_ERASED_LINE_UP * more))
+        width = min(now_width, _WIDEST_PANEL)
+        self._drawn = (self._panel(width), width)
+        return self._drawn[0]
 
 
 def _if_known(value: float | None, form: Callable[[float], str]) -> str:

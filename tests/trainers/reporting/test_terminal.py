@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import io
 import re
+import time
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -139,3 +141,73 @@ def test_counts(number: float, text: str) -> None:
 )  # fmt: skip
 def test_durations(seconds: float, text: str) -> None:
     assert format_duration(seconds) == text
+
+
+class Clock:
+    """Time that passes when it is told to."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_s = 100.0
+        monkeypatch.setattr("trainers.reporting.terminal.time.monotonic", lambda: self.now_s)
+
+
+def live(width: int, file: io.StringIO) -> tuple[Any, Console]:
+    console = Console(file=file, force_terminal=True, width=width)
+    return make_display("grasp-01", 5_000_000, 19, 0, console), console
+
+
+def test_the_time_left_runs_down_between_two_updates(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, file = Clock(monkeypatch), io.StringIO()
+    display, _ = live(80, file)
+    with display:
+        display.advance(LINE)
+        clock.now_s += 12.0
+    shown = without_escapes(file.getvalue())
+    assert "4 min 0 s left" in shown.splitlines()[-3]
+    with display:
+        clock.now_s += 1000.0
+    assert "0 s left" in without_escapes(file.getvalue()).splitlines()[-3]
+
+
+def test_it_is_redrawn_by_itself() -> None:
+    file = io.StringIO()
+    display, _ = live(80, file)
+    with display:
+        display.advance(LINE)
+        deadline = time.monotonic() + 60.0
+        while "1.23M" not in file.getvalue():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 120])
+def test_a_narrow_panel_loses_nothing(width: int) -> None:
+    file = io.StringIO()
+    display, _ = live(width, file)
+    with display:
+        display.update(LONGEST)
+    panel = without_escapes(file.getvalue())
+    assert all(len(line) <= min(width, 100) for line in re.split(r"[\r\n]+", panel))
+    assert "…" not in panel
+    for fact in ("reward -199.999", "lesson 19/19", "success 100%", "23.5k steps/s"):
+        assert fact in panel
+
+
+def test_what_a_narrower_terminal_wrapped_is_erased() -> None:
+    file = io.StringIO()
+    display, console = live(100, file)
+    with display:
+        display.update(LINE)
+        drawn = len(file.getvalue())
+        console.width = 40  # each of the four lines of 100 columns takes three of these
+        display.message("narrower")
+    first = file.getvalue()[drawn:].partition("narrower")[2]
+    assert first.count("\x1b[1A") >= 4 * 2
+    assert "╭─ grasp-01 ───────────────────────────╮" in without_escapes(first)
+
+
+def test_no_color_means_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NO_COLOR", "1")
+    panel = shown(LINE, terminal=True)
+    assert "25%" in panel
+    assert not re.search(r"\x1b\[[0-9;]*(3[0-9]|9[0-7]|38;)[0-9;]*m", panel)
