@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 import os
 import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +34,30 @@ def machine_bytes() -> int:
     return min(known)
 
 
-def shortage(needed_bytes: float) -> str | None:
-    """In words, that the machine has not got so much memory; None where it has."""
+_needs: ContextVar[dict[str, float] | None] = ContextVar("memory_needs", default=None)
+
+
+@contextmanager
+def adding_up() -> Iterator[dict[str, float]]:
+    """Adds up what memory is asked about meanwhile: bytes by what they are for."""
+    needs: dict[str, float] = {}
+    token = _needs.set(needs)
+    try:
+        yield needs
+    finally:
+        _needs.reset(token)
+
+
+def shortage(needed_bytes: float, purpose: str) -> str | None:
+    """In words, that the machine has not got so much memory; None where it has.
+
+    Args:
+        needed_bytes: how much.
+        purpose: what it is for; see `adding_up`.
+    """
+    needs = _needs.get()
+    if needs is not None:
+        needs[purpose] = needs.get(purpose, 0.0) + needed_bytes
     has = machine_bytes()
     if needed_bytes <= has:
         return None

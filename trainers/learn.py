@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import signal
+import socket
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,8 +17,10 @@ from typing import Any
 from trainers.common import process, stopping
 from trainers.common.command import DONE, INTERRUPTED, TERMINATED, tells_failures
 from trainers.common.errors import UserError
-from trainers.common.options import add_results_option, command_parser
+from trainers.common.options import add_results_option, command_parser, version
 from trainers.common.origin import PACKAGES
+
+ASKING_TO_STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @tells_failures
@@ -27,11 +31,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise UserError(shadowed)
     process.prepare()
     # Imported late, so that `--help` and a mistyped option answer at once.
-    from trainers.run import run_file  # noqa: PLC0415
+    # And so does the line that says that something happens.
+    print(f"{version()}: {options.config}", flush=True)
+    from trainers.run import check_file, run_file  # noqa: PLC0415
 
     with stop_on_signals() as stop:
         try:
-            finished = run_file(options, stop.requested)
+            finished = (check_file if options.check else run_file)(options, stop.requested)
         except KeyboardInterrupt:
             return stop.exit_code
     return DONE if finished else stop.exit_code
@@ -52,6 +58,11 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     existing = parser.add_mutually_exclusive_group()
     existing.add_argument("--resume", action="store_true", help="go on with the run of that name")
     existing.add_argument("--force", action="store_true", help="delete the run of that name first")
+    existing.add_argument(
+        "--check",
+        action="store_true",
+        help="only build the run, print the resolved run file, spaces, networks and memory needed",
+    )
     parser.add_argument(
         "--initialize-from", metavar="RUN", help="begin with the weights of a run or a checkpoint"
     )
@@ -103,11 +114,38 @@ def stop_on_signals() -> Iterator[Stop]:
         handlers[signal.SIGHUP] = stop
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
-        yield stop
+        with _answered():
+            yield stop
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def _answered() -> Iterator[None]:
+    """Answers the first signal at once, in a thread: a handler waits for the call under way."""
+    heard, write = socket.socketpair()
+    write.setblocking(False)
+    before = signal.set_wakeup_fd(write.fileno(), warn_on_full_buffer=False)
+    thread = threading.Thread(target=_answer, args=(heard,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        write.close()
+        thread.join()
+        heard.close()
+
+
+def _answer(heard: socket.socket) -> None:
+    """Answers the first request to stop among the signals, whose numbers come in as bytes."""
+    while number := heard.recv(1):
+        if number[0] in ASKING_TO_STOP:
+            name = signal.Signals(number[0]).name
+            print(f"{name}: stopping, and saving first; once more stops at once", file=sys.stderr)
+            return
 
 
 def shadowed_packages() -> str | None:

@@ -5,14 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-from collections.abc import Callable, Iterator
+import shlex
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
+import torch
+
 from envs.environment import EnvironmentFailure
+from envs.memory import adding_up, machine_bytes
 from trainers.algorithms.base import TrainerSettings
 from trainers.common.averager import Averager
 from trainers.common.command import told
+from trainers.common.compilation import Compilation, telling_of_compilation
 from trainers.common.errors import UserError, first_lines
 from trainers.common.files import write_atomically
 from trainers.common.origin import blaming_plugins
@@ -22,11 +27,22 @@ from trainers.held_out import HeldOutEvaluation
 from trainers.inference.construction import check_weights, load_weights
 from trainers.inference.metadata import FILE as METADATA
 from trainers.reporting.event_log import RunLog
+from trainers.reporting.overview import (
+    aligned,
+    memory,
+    networks,
+    parameter_count,
+    policy_commands,
+    resume_command,
+    spaces,
+)
+from trainers.reporting.pace import Pace
 from trainers.reporting.summary import Summary
-from trainers.reporting.terminal import TerminalDisplay, make_display
+from trainers.reporting.terminal import make_display
 from trainers.runfile.changes import changeable, changes
 from trainers.runfile.registry import Registries, load_registries
 from trainers.runfile.settings import RunSettings, dump_yaml, load_run
+from trainers.runfile.trust import needs_trust
 from trainers.saving.checkpoint import Checkpoints, Loaded
 from trainers.saving.run_folder import (
     CHECKPOINTS,
@@ -46,7 +62,7 @@ _logger = logging.getLogger("ventosa")
 
 
 def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) -> bool:
-    """Does what the command line asks for.
+    """Trains as the command line asks for.
 
     Args:
         options: as `trainers.learn.parse` returns them.
@@ -59,14 +75,14 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
         UserError: the user's mistake.
         Exception: the run can't go on; a note names its last checkpoint.
     """
-    registries = load_registries()
-    run = load_run(options.config, options.overrides + _flags(options), registries)
+    run, registries = _load_run(options)
     settings = run.trainer.settings
     assert isinstance(settings, TrainerSettings)  # the registry sees to it
     run_id = run_name(options.config.stem if options.run_id is None else options.run_id)
     directory = options.results_dir / run_id
     checkpoints = Checkpoints(directory / CHECKPOINTS, settings.keep_checkpoints)
     with ExitStack() as stack:
+        compilation = stack.enter_context(telling_of_compilation(_tell))
         lock = claim(directory, resume=options.resume, force=options.force)
         stack.enter_context(closing(lock))
         resumed = checkpoints.load_latest() if options.resume else None
@@ -85,25 +101,143 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
             return True
         files = {CONFIGURATION: dump_yaml(run), METADATA: session.metadata.to_json()}
         begin(directory, files, resume=options.resume)
-        with (
-            closing(RunLog(directory, start if resumed else None)) as log,
-            make_display(run_id, settings.max_steps, session.lesson_count, start) as display,
-            _timers_written(directory),
-        ):
-            log.text("configuration", f"```yaml\n{dump_yaml(run)}```", start)
-            for note in notes:
-                display.message(note)
-            env = session.env_runner.env
-            summary = Summary(log, run_id, env, settings.max_steps, settings.summary_freq, start)
-            if held_out is not None:
-                # A checkpoint has no score where its evaluation was cut off: it is made up for.
-                if held_out.begins_due and (resumed is None or resumed.score is None):
-                    held_out.log(log)
-                summary.note_evaluation(held_out.latest)
-            training = Training(
-                session, settings, log, summary, checkpoints, display, held_out, resumed
-            )
-            return _train(training, session, summary, checkpoints, display).finished
+        _tell(*_banner(run, session, directory))
+        pace = _pace(run, settings, start, held_out, compilation)
+        ending = _learn(run, session, checkpoints, held_out, resumed, notes, pace)
+        step = session.env_runner.step_count
+        _tell(*_farewell(options, run, checkpoints, ending, step))
+        return ending.finished
+
+
+def _learn(
+    run: RunSettings,
+    session: Session,
+    checkpoints: Checkpoints,
+    held_out: HeldOutEvaluation | None,
+    resumed: Loaded | None,
+    notes: Sequence[str],
+    pace: Pace,
+) -> Ending:
+    """Trains a session that can begin, and reports into its run's folder and on the terminal."""
+    settings, start = run.trainer.settings, session.env_runner.step_count
+    assert isinstance(settings, TrainerSettings)
+    directory = checkpoints.directory.parent
+    run_id = directory.name
+    with (
+        closing(RunLog(directory, start if resumed else None)) as log,
+        make_display(run_id, settings.max_steps, session.lesson_count, start) as display,
+        _timers_written(directory),
+    ):
+        log.text("configuration", f"```yaml\n{dump_yaml(run)}```", start)
+        for note in notes:
+            display.message(note)
+        env = session.env_runner.env
+        steps = (settings.max_steps, settings.summary_freq, start)
+        summary = Summary(log, run_id, env, *steps, pace)
+        if held_out is not None:
+            # A checkpoint has no score where its evaluation was cut off: it is made up for.
+            if held_out.begins_due and (resumed is None or resumed.score is None):
+                held_out.log(log)
+            summary.note_evaluation(held_out.latest)
+        training = Training(
+            session, settings, log, summary, checkpoints, display, held_out, resumed
+        )
+        return _train(training, session, summary, checkpoints)
+
+
+def check_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) -> bool:
+    """Builds what the command line asks for, and prints what that is; writes nothing.
+
+    Args:
+        options: as `trainers.learn.parse` returns them.
+        stop_requested: asked before every step of the evaluation.
+
+    Returns:
+        Whether all was built; False if that was stopped.
+
+    Raises:
+        UserError: the user's mistake: all those that keep a run from beginning.
+    """
+    run, registries = _load_run(options)
+    with ExitStack() as stack:
+        stack.enter_context(telling_of_compilation(_tell))
+        needs = stack.enter_context(adding_up())
+        session = stack.enter_context(closing(Session(run, registries, stop_requested)))
+        try:
+            notes = _start(session, options, None)
+            stack.enter_context(_held_out(session, run, 0, stop_requested))
+        except StopRequested:
+            return False
+        _tell(
+            dump_yaml(run),
+            *notes,
+            *spaces(session.env_runner.env),
+            *networks(session.algorithm.policy),
+            *memory(needs, machine_bytes()),
+            "all of it can be built; nothing was written",
+        )
+    return True
+
+
+def _load_run(options: argparse.Namespace) -> tuple[RunSettings, Registries]:
+    registries = load_registries()
+    return load_run(options.config, options.overrides + _flags(options), registries), registries
+
+
+def _tell(*lines: str) -> None:
+    print(*lines, sep="\n", flush=True)
+
+
+def _banner(run: RunSettings, session: Session, directory: Path) -> list[str]:
+    """What is trained, on what, and where to watch it."""
+    return aligned(
+        {
+            "environment": f"{run.environment.name}, {session.env_runner.env.num_envs} in parallel",
+            "trainer": run.trainer.name,
+            "parameters": f"{parameter_count(session.algorithm.policy):,}",
+            "device": f"{run.device}, {torch.get_num_threads()} threads",
+            "run folder": str(directory),
+            "TensorBoard": f"tensorboard --logdir {shlex.quote(str(directory.parent))}",
+        }
+    )
+
+
+def _farewell(
+    options: argparse.Namespace,
+    run: RunSettings,
+    checkpoints: Checkpoints,
+    ending: Ending,
+    step: int,
+) -> list[str]:
+    """How a run ended, at that step, where everything is, and the commands to go on with."""
+    best, settings = checkpoints.best, run.trainer.settings
+    assert isinstance(settings, TrainerSettings)
+    directory = checkpoints.directory.parent
+    score = "" if best.score is None else f" ({best.score_of} {best.score:.3g})"
+    entries = {
+        "run folder": str(directory),
+        "best": f"{best.path}{score}",
+        **policy_commands(directory, trust=needs_trust(run)),
+    }
+    if not ending.finished:
+        entries["go on"] = resume_command(options)
+    elif step >= settings.max_steps:
+        entries["train on"] = resume_command(options, 2 * settings.max_steps)
+    return [f"finished: {ending.reason}" if ending.finished else ending.reason, *aligned(entries)]
+
+
+def _pace(
+    run: RunSettings,
+    settings: TrainerSettings,
+    start: int,
+    held_out: HeldOutEvaluation | None,
+    compilation: Compilation,
+) -> Pace:
+    """Estimates the time left; the first evaluation is none to go by if kernels were compiled."""
+    if run.evaluation is None or held_out is None:
+        return Pace(start, settings.max_steps)
+    evaluation_s = 0.0 if compilation.happened else held_out.took_s
+    return Pace(start, settings.max_steps, run.evaluation.interval, evaluation_s)
 
 
 @contextmanager
@@ -139,7 +273,6 @@ def _train(
     session: Session,
     summary: Summary,
     checkpoints: Checkpoints,
-    display: TerminalDisplay,
 ) -> Ending:
     """Trains, and leaves the run's state in status.json however it ends."""
     state, reason = "failed", None
@@ -147,8 +280,6 @@ def _train(
         with blaming_plugins():
             ending = training.run()
         state, reason = "finished" if ending.finished else "interrupted", ending.reason
-        if not ending.finished:
-            display.message("stopped and saved; go on with --resume")
         return ending
     except KeyboardInterrupt:
         state, reason = "interrupted", f"stopped at once; {_last_good(checkpoints)}"

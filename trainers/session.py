@@ -211,7 +211,7 @@ def _check_network_size(run: RunSettings, factory: NetworkFactory) -> None:
         except RuntimeError:
             return  # a plugin's networks, which look at values as they are built
     count = sum(parameter.numel() for parameter in policy.parameters())
-    if lack := shortage(count * BYTES_PER_PARAMETER):
+    if lack := shortage(count * BYTES_PER_PARAMETER, "networks and optimizers"):
         raise UserError(
             f"trainer.network_settings and encoders: to train networks with {count:,} parameters "
             f"{lack}: make hidden layers or encoders smaller"

@@ -95,7 +95,7 @@ class GraspVectorEnv(Environment):
         self._image_spaces = image_spaces(settings)
         self.privileged = frozenset({PRIVILEGED}) & self.single_observation_space.keys()
         per_env = OBSERVATIONS_HELD * space_bytes(self.single_observation_space)
-        if lack := shortage(self.num_envs * per_env):
+        if lack := shortage(self.num_envs * per_env, "environments"):
             raise ValueError(
                 f"num_envs {self.num_envs}: to hold the images of so many cameras {lack}: lower "
                 "it, or let the network see fewer pixels (cameras, sampling)"

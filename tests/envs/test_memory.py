@@ -12,7 +12,7 @@ from gymnasium.spaces import Box, Discrete
 
 from encoders.spaces import DepthImage
 from envs import memory
-from envs.memory import machine_bytes, shortage, space_bytes
+from envs.memory import adding_up, machine_bytes, shortage, space_bytes
 
 
 @pytest.fixture(autouse=True)
@@ -41,9 +41,9 @@ def test_the_process_own_limit_counts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_shortage_has_both_numbers() -> None:
-    assert shortage(2**35) is None
-    assert shortage(2**35 + 1) == "needs 34.4 GB, and the machine has 34.4 GB"
-    assert shortage(8e12) == "needs 8,000.0 GB, and the machine has 34.4 GB"
+    assert shortage(2**35, "all") is None
+    assert shortage(2**35 + 1, "all") == "needs 34.4 GB, and the machine has 34.4 GB"
+    assert shortage(8e12, "all") == "needs 8,000.0 GB, and the machine has 34.4 GB"
 
 
 def test_bytes_of_a_space() -> None:
@@ -52,3 +52,12 @@ def test_bytes_of_a_space() -> None:
         {**pictures, "state": Box(-1, 1, (5,), np.float32), "one": Discrete(7)}
     )
     assert space_bytes(space) == 4 * 3 * 2 + 4 * 3 * 3 + 5 * 4 + 8
+
+
+def test_what_is_asked_about_is_added_up_by_what_it_is_for() -> None:
+    with adding_up() as needs:
+        shortage(10, "images")
+        shortage(5, "networks")
+        shortage(7, "images")
+    shortage(1, "networks")
+    assert needs == {"images": 17, "networks": 5}

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
+import io
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +23,7 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from envs.grasp.simulators import workers
+from trainers.common.options import version
 from trainers.experience.env_runner import EnvRunner
 from trainers.learn import Stop, main, parse, stop_on_signals
 from trainers.runfile.registry import Registries
@@ -92,6 +98,7 @@ LESSONS = {
     "min_lesson_length": 9,
     "lessons": [{"threshold": 0.9, "parameters": {"scale": 2.0}}, {"parameters": {"scale": 1.0}}],
 }
+FINISHED = "finished: max_steps: 64 steps were taken"
 CAMERA = {"camera": {"type": "conv", "layers": [[2, 3, 2]]}}
 
 
@@ -160,9 +167,59 @@ def test_the_status_says_how_it_ended(short_run: Any) -> None:
 
 def test_the_terminal_says_where_the_run_stands(short_run: Any) -> None:
     lines = short_run.output.splitlines()
-    assert lines[0] == "toy: to step 64"
-    assert [line.split()[0] for line in lines[1:]] == ["16/64", "32/64", "48/64", "64/64"]
-    assert "lesson 1/2" in lines[-1]
+    begin, end = lines.index("toy: to step 64"), lines.index(FINISHED)
+    points = lines[begin + 1 : end]
+    assert [line.split()[0] for line in points] == ["16/64", "32/64", "48/64", "64/64"]
+    assert "lesson 1/2" in points[-1]
+
+
+def test_it_says_first_what_it_trains_and_last_how_to_go_on(
+    short_run: Any, learn: Learn, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    lines = [" ".join(line.split()) for line in short_run.output.splitlines()]
+    assert lines[0] == f"{version()}: {tmp_path / 'toy.yaml'}"
+    assert lines[1] == "environment picture, 4 in parallel"
+    results = short_run.results
+    assert f"TensorBoard tensorboard --logdir {results}" in lines
+    commands = {line.split(" python -m ")[0]: line for line in lines if " python -m " in line}
+    assert commands["evaluate"].endswith(f"trainers.evaluate {results / 'toy'}")
+    assert commands["export"].endswith(f"trainers.export {results / 'toy'} policies/toy")
+    words = shlex.split(commands["train on"])[4:]  # without "train on python -m trainers.learn"
+    assert words[-3:] == ["--results-dir", str(results), "--resume"]
+    del words[-3:-1]  # which `learn` gives
+    longer = learn(*words[1:])
+    assert (longer.code, longer.step) == (0, 128)
+
+
+def test_a_check_builds_everything_and_writes_nothing(
+    learn: Learn, write_run: WriteRun, tmp_path: Path
+) -> None:
+    config = write_run("picture", encoders=CAMERA, evaluation={"interval": 32, "episodes": 4})
+    before = everything(tmp_path)
+    done = learn(config, "--check", "--seed", 7)
+    assert (done.code, done.errors) == (0, "")
+    _, told = done.output.split("\n", 1)
+    resolved, rest = told.split("\n\n")
+    assert yaml.safe_load(resolved)["seed"] == 7
+    lines = [" ".join(line.split()) for line in rest.splitlines()]
+    assert lines[:2] == [
+        "observations",
+        "camera DepthImage(8, 8, range_m=(0.5, 40.0), encoding='uint16')",
+    ]
+    assert "actor.frame_encoders.camera" in rest  # the layers of its network
+    assert lines[-1] == "all of it can be built; nothing was written"
+    assert everything(tmp_path) == before
+    assert not done.results.exists()
+
+
+def test_a_check_finds_what_only_the_first_evaluation_shows(
+    learn: Learn, write_run: WriteRun
+) -> None:
+    target = {"metric": "sucess", "at_least": 1.0}
+    config = write_run(evaluation={"interval": 32, "episodes": 4, "stop_when": target})
+    done = learn(config, "--check")
+    assert done.code == 2
+    assert "evaluation.stop_when.metric: 'sucess' is not among" in done.errors
 
 
 def test_its_configuration_is_the_run_and_runs_again_to_the_same_weights(
@@ -310,9 +367,9 @@ def test_a_finished_run_that_is_resumed_says_what_to_raise_and_stays_as_it_is(
     before = everything(learn(config).results)
     again = learn(config, "--resume")
     assert again.code == 0
-    assert again.output == (
-        "toy: finished already, at step 64 (trainer.max_steps: 64): raise that to go on\n"
-    )
+    assert again.output.splitlines()[1:] == [
+        "toy: finished already, at step 64 (trainer.max_steps: 64): raise that to go on"
+    ]
     assert everything(again.results) == before
     assert learn(config, "--resume", "trainer.max_steps=80").step == 80
 
@@ -473,14 +530,50 @@ def test_a_signal_saves_the_run_for_a_later_resume(
         stopped = learn(config)
     assert signal.getsignal(number) == before
     assert stopped.code == code
-    assert "stopped and saved; go on with --resume" in stopped.output
+    assert stopped.output.splitlines()[-6] == "stopped, and saved"
+    assert stopped.output.endswith(f"--results-dir {stopped.results} --resume\n")
+    assert stopped.errors == (
+        f"{number.name}: stopping, and saving first; once more stops at once\n"
+    )
     assert status(stopped.results)["state"] == "interrupted"
     assert stopped.step == 32  # of the 40 steps, those of the last update
     resumed = learn(config, "--resume")
     assert resumed.code == 0
-    assert resumed.output.startswith("toy: from step 32 to step 64")
+    assert "\ntoy: from step 32 to step 64\n" in resumed.output
     assert status(resumed.results)["state"] == "finished"
     assert resumed.step == 64
+
+
+def test_a_signal_is_answered_while_a_call_does_not_return(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    said, libc = io.StringIO(), ctypes.CDLL(None)
+    monkeypatch.setattr(sys, "stderr", said)
+    mutex = ctypes.create_string_buffer(64)  # of zeros: what waits for it hears of no signal
+    libc.pthread_mutex_lock(mutex)
+    answered: list[bool] = []
+
+    def ask() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        deadline = time.monotonic() + 60.0
+        while not said.getvalue().endswith("\n") and time.monotonic() < deadline:
+            time.sleep(0.01)
+        answered.append("SIGTERM: stopping, and saving first" in said.getvalue())
+        libc.pthread_mutex_unlock(mutex)
+
+    with stop_on_signals() as stop:
+        asking = threading.Thread(target=ask)
+        asking.start()
+        libc.pthread_mutex_lock(mutex)
+        asking.join()
+        assert stop.requested()
+    assert answered == [True]
+
+
+def test_signals_that_ask_for_nothing_are_not_answered(capfd: pytest.CaptureFixture[str]) -> None:
+    with stop_on_signals():
+        os.kill(os.getpid(), signal.SIGALRM)
+    assert capfd.readouterr().err == ""
 
 
 def test_the_second_signal_insists() -> None:
@@ -532,9 +625,9 @@ def test_a_checkpoint_cut_short_is_passed_over_with_a_note(
     done = learn(config, "--resume", "trainer.max_steps=80")
     assert done.code == 0
     lines = done.output.splitlines()
-    assert lines[0] == "toy: from step 32 to step 80"
-    assert "passed over the damaged checkpoint" in lines[1]
-    assert "step-64: state.safetensors is cut short" in lines[1]
+    note = lines[lines.index("toy: from step 32 to step 80") + 1]
+    assert "passed over the damaged checkpoint" in note
+    assert "step-64: state.safetensors is cut short" in note
     assert latest(results, "toy").step == 80
     events = EventAccumulator(str(results / "toy"))
     events.Reload()
@@ -655,7 +748,7 @@ def test_ctrl_c_and_sigterm_stop_a_process_and_its_workers_quietly(
         stop(process.pid)
         output, errors = process.communicate(timeout=120)
         assert process.returncode == code, errors
-        assert "stopped and saved; go on with --resume" in output
+        assert "stopped, and saved\n" in output
         assert "Traceback" not in errors
         step = latest(tmp_path / "results", name).step
         assert step >= 16

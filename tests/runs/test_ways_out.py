@@ -20,6 +20,7 @@ from torch.utils.tensorboard import SummaryWriter
 from trainers import evaluate
 from trainers import run as run_module
 from trainers.algorithms.ppo import PPO
+from trainers.common.options import version
 from trainers.comparison.results import STATUS, read_status
 from trainers.experience.env_runner import EnvRunner
 from trainers.learn import main
@@ -247,7 +248,7 @@ def test_a_closed_output_and_the_end_of_the_terminal_lose_nothing(
     )
     assert process.stdout is not None
     assert process.stderr is not None
-    assert process.stdout.readline() == "toy: to step 1G\n"
+    assert process.stdout.readline() == f"{version()}: {config}\n"
     process.stdout.close()  # as `| head -1` does
     run = tmp_path / "results/toy"
     until((run / "checkpoints/step-256").exists)

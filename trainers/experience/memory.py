@@ -22,7 +22,7 @@ def check_room(env: Environment, steps: int, setting: str) -> None:
         UserError: with how much it would take.
     """
     per_step = env.num_envs * space_bytes(env.single_observation_space) + BYTES_PER_STEP
-    if lack := shortage(steps * per_step):
+    if lack := shortage(steps * per_step, "collected between updates"):
         raise UserError(
             f"{setting}: to collect {steps * env.num_envs:,} transitions before an update {lack}: "
             "lower it"

@@ -71,7 +71,8 @@ class ReplayBuffer:
         size = self._rows * num_envs
         frames = {k: _kind(part) for k, part in space.spaces.items() if is_frame(part)}
         vectors = {k: _kind(part) for k, part in space.spaces.items() if not is_frame(part)}
-        if lack := shortage(size * (space_bytes(space) + BYTES_BESIDE + 4 * action_size)):
+        needed_bytes = size * (space_bytes(space) + BYTES_BESIDE + 4 * action_size)
+        if lack := shortage(needed_bytes, "replay buffer"):
             raise UserError(
                 f"trainer.hyperparameters.buffer_size: to keep {capacity:,} transitions {lack}: "
                 "lower it"

@@ -41,6 +41,12 @@ def check_imports(run: RunSettings, origin: str, *, trust: bool = False) -> None
             ) from error
 
 
+def needs_trust(run: RunSettings) -> bool:
+    """Whether a command has to be told to trust what the run's environment imports."""
+    modules = run.environment.cls.imports(run.environment.settings)
+    return not all(map(_is_of_a_plugin, modules))
+
+
 def _is_of_a_plugin(module: str) -> bool:
     """Whether a module is in the package of an installed plugin."""
     points = importlib.metadata.entry_points(group=PROJECT_NAME)

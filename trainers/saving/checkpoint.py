@@ -196,6 +196,11 @@ class Checkpoints:
         readable = [entry for entry in self._entries() if entry.serial is not None]
         return sorted(readable, key=_age_order)
 
+    @property
+    def best(self) -> CheckpointInfo:
+        """The one that `load_best` would load, if it is not damaged; there has to be one."""
+        return _by_merit(self._entries())[0]
+
     def load_latest(self, *, with_state: bool = True) -> Loaded:
         """Load the checkpoint saved last, or the newest that is not damaged.
 
