@@ -13,7 +13,6 @@ from enum import Enum, StrEnum, auto
 from typing import Any
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from envs.grasp.evaluation.pose_commands import PoseCommands
@@ -39,6 +38,7 @@ from envs.grasp.simulators.bodies import (
     take_picture,
     turned,
 )
+from envs.grasp.simulators.bullet import pybullet
 from envs.grasp.simulators.colors import BLOCK_RGBA
 from envs.grasp.simulators.pybullet import projection_matrices, view_matrices
 

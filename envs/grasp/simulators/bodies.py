@@ -9,13 +9,13 @@ import sys
 from dataclasses import dataclass
 
 import numpy as np
-import pybullet
 
 from envs.grasp.robot.urdf import Robot
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import sampling
 from envs.grasp.settings import Camera, Support
 from envs.grasp.simulators.base import Floats, Images
+from envs.grasp.simulators.bullet import pybullet
 from envs.grasp.simulators.colors import AROUND_RGBA, SUPPORT_RGBA
 
 Rgba = tuple[float, float, float, float]

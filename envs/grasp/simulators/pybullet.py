@@ -7,7 +7,6 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from encoders.spaces import DepthImage
@@ -34,6 +33,7 @@ from envs.grasp.simulators.bodies import (
     take_picture,
     turned,
 )
+from envs.grasp.simulators.bullet import pybullet
 from envs.grasp.simulators.colors import BLOCK_RGBA
 
 # A client costs 30 MB whatever it holds, so worlds share them; but every block that is parked while
