@@ -50,7 +50,8 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
         snapshot: the type of what its rewards are computed from; its constructor gives the rewards
             to `rewards.reward.fitting`, which refuses those for another one.
         pays_by_itself: whether it has a reward of its own, where a run lists none.
-        parameter_names: the environment parameters that curricula and samplers may set.
+        parameter_names: the environment parameters that curricula and samplers may set. They may be
+            of the class or of the instance.
         privileged: names of observations that only a critic may see: a policy does not, unless the
             run file says so. They may be of the class or of the instance.
         evaluation_episodes: how many an evaluation plays unless it is told otherwise.
@@ -61,7 +62,7 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
     Settings: ClassVar[type[BaseModel]]
     snapshot: ClassVar[type] = object
     pays_by_itself: ClassVar[bool] = True
-    parameter_names: ClassVar[frozenset[str]] = frozenset()
+    parameter_names: frozenset[str] = frozenset()
     privileged: frozenset[str] = frozenset()
     evaluation_episodes: ClassVar[int] = 100
     evaluation_options: ClassVar[tuple[EvaluationOption, ...]] = ()

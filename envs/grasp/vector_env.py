@@ -69,9 +69,7 @@ class GraspVectorEnv(Environment):
     Settings = GraspSettings
     snapshot: ClassVar[type[GraspTransition]] = GraspTransition
     pays_by_itself: ClassVar[bool] = False
-    parameter_names: ClassVar[frozenset[str]] = frozenset(
-        {*GOAL_PARAMETERS, *SENSOR_PARAMETERS, YAW_LIMIT}
-    )
+    parameter_names = frozenset({*GOAL_PARAMETERS, *SENSOR_PARAMETERS, YAW_LIMIT})
     evaluation_episodes: ClassVar[int] = 1000
     evaluation_options: ClassVar[tuple[EvaluationOption, ...]] = EVALUATION_OPTIONS
     metadata: dict[str, Any] = {  # noqa: RUF012

@@ -10,13 +10,16 @@ from __future__ import annotations
 
 import copy
 import traceback
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from curricula.samplers import ParameterValue
 from envs.environment import EnvironmentFailure
+from envs.gym.parameters import AttributeParameters, pick
 from envs.gym.returned import WrongReturn, checked_reset, checked_step
 
 IS_SUCCESS = "is_success"
@@ -32,6 +35,9 @@ def episode_seed(run_seed: int, index: int, episode: int) -> int:
 
 class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
     """One of a run's environments; seeds each of its episodes, and checks what it returns.
+
+    The environment's parameters are drawn for each episode, from a stream that follows from its
+    number as its seed does.
 
     An environment may use an array again that it has handed out, or share it with the others in its
     process. So observations are copied before anything else happens, and so is the info that an
@@ -60,6 +66,20 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._run_seed, self._index, self._with_infos = run_seed, index, with_infos
         self._begun = self._steps = 0  # episodes, and steps of the last of them
         self._last_info: dict[str, Any] = {}
+        self._parameters = AttributeParameters(env)
+        self._drawn: dict[str, float] = {}
+
+    def known_parameters(self) -> frozenset[str]:
+        """Names of the environment's parameters."""
+        return self._parameters.names
+
+    def set_parameters(self, parameters: Mapping[str, ParameterValue]) -> None:
+        """Sets parameters of the episodes that begin from now on."""
+        self._parameters.given = parameters
+
+    def drawn_parameters(self) -> dict[str, float]:
+        """What was drawn for the running episode."""
+        return self._drawn
 
     def count_from(self, run_seed: int, begun: NDArray[np.int64]) -> None:
         """Goes to where some episodes had begun.
@@ -81,16 +101,7 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         Raises:
             EnvironmentFailure: the environment failed, or returned what it may not.
         """
-        own = episode_seed(self._run_seed, self._index, self._begun)
-        self._begun += 1
-        self._steps = 0
-        try:
-            returned = self.env.reset(seed=own, options=options)
-            observation, _ = checked_reset(self._space, returned)
-        except (Exception, SystemExit) as error:
-            raise self._failure(error) from error
-        info, self._last_info = self._last_info, {}
-        return _copied(observation), info
+        return self._begin({}, options)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Steps the environment; errors as `reset`'s."""
@@ -107,17 +118,41 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
             info = self._last_info = copy.deepcopy(info)
         return _copied(observation), reward, terminated, truncated, info
 
-    def play(self, lengths: NDArray[np.int64], actions: NDArray[Any]) -> Any:
+    def play(
+        self,
+        drawn: Mapping[str, NDArray[np.float64]],
+        lengths: NDArray[np.int64],
+        actions: NDArray[Any],
+    ) -> Any:
         """Plays an episode from its beginning; returns the last observation.
 
         Args:
+            drawn: (N,) values of its parameters by name, of all the run's environments; where there
+                is NaN, one is drawn.
             lengths: (N,) steps of the episode, of all the run's environments.
             actions: (T, N, ...) the last T steps' actions, T being the greatest length.
         """
-        observation, _ = self.reset()
+        observation, _ = self._begin(pick(drawn, self._index), None)
         for action in actions[len(actions) - lengths[self._index] :, self._index].copy():
             observation, *_ = self.step(action)
         return observation
+
+    def _begin(
+        self, drawn: Mapping[str, float], options: dict[str, Any] | None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins the next episode, with some parameters' values; the others are drawn."""
+        number = (self._run_seed, self._index, self._begun)
+        self._begun += 1
+        self._steps = 0
+        self._drawn = {**self._parameters.draw(*number), **drawn}
+        try:
+            self._parameters.apply(self._drawn)
+            returned = self.env.reset(seed=episode_seed(*number), options=options)
+            observation, _ = checked_reset(self._space, returned)
+        except (Exception, SystemExit) as error:
+            raise self._failure(error) from error
+        info, self._last_info = self._last_info, {}
+        return _copied(observation), info
 
     def _failure(self, error: BaseException) -> EnvironmentFailure:
         """Says which environment failed, when, why and where."""

@@ -11,11 +11,13 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from curricula.samplers import ParameterValue
 from envs.environment import Environment, EnvironmentFailure, ObservationArrays, StepResult
 from envs.evaluation import SUCCESS
 from envs.gym.action_history import ActionHistory
 from envs.gym.episodes import IS_SUCCESS
 from envs.gym.making import make_vector_env
+from envs.gym.parameters import gather
 from envs.gym.settings import GymSettings
 from envs.gym.spaces import ActionAdapter, ObservationAdapter
 from rewards.gym.transition import GymTransition
@@ -38,6 +40,9 @@ class GymEnvironment(Environment):
     everything from gymnasium's `np_random` and keeps nothing from one episode to the next; where it
     is not, a warning is logged. The actions of an episode of over `LONGEST_REPLAY_STEPS` are given
     up, as it may never end: the next one begins in its place, after a warning, too.
+
+    Its parameters are those that the environment declares, or attributes of it: see
+    `envs.gym.parameters`.
 
     Args:
         settings: which environment.
@@ -74,6 +79,8 @@ class GymEnvironment(Environment):
         self._history = ActionHistory(self.action_space.shape or (), self.action_space.dtype)
         self._observations: ObservationArrays = {}
         self._tells_success = False  # no episode that did has ended yet
+        self.parameter_names = self._call("known_parameters")[0]
+        self._has_parameters = False  # none is set yet
 
     @classmethod
     def imports(cls, settings: BaseModel) -> tuple[str, ...]:
@@ -134,9 +141,16 @@ class GymEnvironment(Environment):
             reward = sum(terms.values(), np.zeros(self.num_envs))
         return self._observations, reward, terminated, truncated, infos
 
+    def set_parameters(self, parameters: Mapping[str, ParameterValue]) -> None:
+        """See `Environment.set_parameters`."""
+        super().set_parameters(parameters)
+        self._call("set_parameters", dict(parameters))
+        self._has_parameters |= bool(parameters)
+
     def state_dict(self) -> dict[str, Any]:
         """See `Environment.state_dict`."""
         self._history.keep(self._longest_replay())
+        drawn = self._call("drawn_parameters") if self._has_parameters else []
         return {
             "seed": self._seed,
             "begun": self._begun.copy(),
@@ -144,13 +158,15 @@ class GymEnvironment(Environment):
             "actions": self._history.actions,
             "observations": self._observations,
             "tells_success": self._tells_success,
+            "parameters": gather(drawn),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> ObservationArrays:
         """See `Environment.load_state_dict`; plays the running episodes again.
 
         Raises:
-            ValueError: the state has other actions than those of its episodes.
+            ValueError: the state has other actions than those of its episodes, or parameters that
+                the environment does not have.
         """
         self._check(state)
         self._seed = state["seed"]
@@ -160,7 +176,11 @@ class GymEnvironment(Environment):
         endless = self._lengths > len(state["actions"])
         self._pass_over(endless)
         self._call("count_from", self._seed, self._begun - 1)
-        played = self._call("play", self._lengths, state["actions"])
+        drawn = {
+            name: np.where(endless, np.nan, values)
+            for name, values in state.get("parameters", {}).items()
+        }
+        played = self._call("play", drawn, self._lengths, state["actions"])
         self._observations = self._observe(self._stacked(played))
         if not _equal(self._observations, state["observations"], ~endless):
             _logger.warning(
@@ -180,6 +200,11 @@ class GymEnvironment(Environment):
             raise ValueError(
                 f"episodes {begun} of {lengths} steps, where {len(actions)} have actions"
             )
+        parameters = state.get("parameters", {})
+        if unknown := sorted(parameters.keys() - self.parameter_names):
+            raise ValueError(f"parameters {unknown}, which the environment does not have")
+        if any(values.shape != (self.num_envs,) for values in parameters.values()):
+            raise ValueError(f"not one value for each of {self.num_envs} environments: parameters")
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the environments."""
