@@ -51,7 +51,7 @@ def convert(path: Path, behavior: str | None, env_id: str | None, registries: Re
     if env_id is None:
         title.append(
             "Fill in environment.id, the gymnasium environment in the place of Unity's executable: "
-            "docs/coming_from_ml_agents.md."
+            "docs/coming_from.md."
         )
     return f"{conversion.account.comments(*title)}\n{dump(run.data)}"
 

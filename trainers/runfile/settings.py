@@ -15,6 +15,7 @@ from pydantic import BaseModel, Field, TypeAdapter
 
 from curricula.samplers import ParameterValue
 from trainers.common.errors import suggestion
+from trainers.runfile.foreign_keys import foreign_file
 from trainers.runfile.former_keys import brought_up_to_date, tell
 from trainers.runfile.inheritance import read_run_file
 from trainers.runfile.registry import Registries, Registry, UnknownComponentError
@@ -224,6 +225,8 @@ class _Sections:
         self.problems: list[Problem] = []
 
     def run(self) -> RunSettings:
+        if problem := foreign_file(self.document):
+            raise SettingsError([problem])
         for path in not_finite(self.document.data):
             self.problem(path, "should be a finite number")
         if self.problems:

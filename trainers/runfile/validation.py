@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from trainers.common.errors import suggestion
+from trainers.runfile.foreign_keys import way_out
 from trainers.runfile.yaml_document import KeyPath, dotted, shown
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -61,7 +62,7 @@ def validate(model: type[Model], data: Any, beside: tuple[str, ...] = ()) -> Mod
         # As JSON: there, strict still takes an integer for a float and a list for a tuple.
         return model.model_validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
-        details = error.errors(include_url=False)
+        details = [item for item in error.errors(include_url=False) if not was_shortened(item)]
     messages: dict[KeyPath, list[str]] = {}
     paths = [data_path(item, data) for item in details]
     for path, item in zip(paths, details, strict=True):
@@ -74,6 +75,11 @@ def validate(model: type[Model], data: Any, beside: tuple[str, ...] = ()) -> Mod
     raise InvalidError(
         [(path, "; or ".join(dict.fromkeys(said))) for path, said in messages.items()]
     )
+
+
+def was_shortened(item: ErrorDetails) -> bool:
+    """Whether a list is only too short once pydantic left out the items that are told of anyway."""
+    return item["type"] == "too_short" and len(item["input"]) >= item["ctx"]["min_length"]
 
 
 def data_path(item: ErrorDetails, data: Any) -> KeyPath:
@@ -101,7 +107,8 @@ def message(
             owners = models_at(model, path[:-1], data)
             known = [name for owner in owners for name in owner.model_fields]
             known.extend(beside if len(path) == 1 else ())
-            said = f"unknown key; {suggestion(str(path[-1]), known)}"
+            hint = way_out(path[-1:]) or suggestion(str(path[-1]), known)
+            said = f"unknown key; {hint}"
         case "missing":
             said = f"missing: {missing(models_at(model, path[:-1], data), path[-1])}"
         case "value_error":
@@ -111,7 +118,8 @@ def message(
             hint = suggestion(tag, [name.strip("'") for name in expected.split(", ")])
             said = f"unknown name '{tag}'; {hint}"
         case "union_tag_not_found":
-            said = f"needs the key {context['discriminator']}, which says what it is"
+            needed = f"needs the key {context['discriminator']}, which says what it is"
+            said = way_out(item["input"]) or needed
         case kind:
             plain = PLAIN_WORDS.get(kind, re.sub(PYDANTIC_EXTRAS, "", item["msg"]))
             said = f"{plain}, not {shown(item['input'])}"
