@@ -15,11 +15,13 @@ from trainers.runfile.yaml_document import (
 )
 
 EXTENDS = "extends"
+OWN_KEYS = "x-"
+"""Beginning of keys at the top that are for the user's own use, for anchors above all."""
 TYPE_KEYS = ("type", "trainer_type")
 
 
 def read_run_file(path: Path) -> Document:
-    """Reads a run file and what it extends; the key itself is not in the result.
+    """Reads a run file and what it extends; that key and those with `x-` are not in the result.
 
     A mapping adds to that of the base and overrides it key by key. Anything else takes the place of
     what the base has: a number, a list, `null`, and a mapping whose `type` is another, because the
@@ -34,6 +36,8 @@ def read_run_file(path: Path) -> Document:
 
 def _read(path: Path, extending: tuple[Path, ...]) -> Document:
     document = read(path)
+    for key in [key for key in document.data if key.startswith(OWN_KEYS)]:
+        del document.data[key]
     if EXTENDS not in document.data:
         return document
     place = document.where((EXTENDS,))

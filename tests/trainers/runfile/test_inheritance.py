@@ -113,3 +113,12 @@ def test_a_base_that_is_none_is_refused(write: Write, name: str, message: str) -
     path = write("own.yaml", f"extends: {name}\n")
     with pytest.raises(SettingsError, match=message):
         read_run_file(path)
+
+
+def test_keys_that_begin_with_x_are_for_anchors(write: Write) -> None:
+    write("base.yaml", "x-small: &small {size: 1}\nx-list: [1]\na: *small\n")
+    path = write(
+        "own.yaml", "extends: base.yaml\nx-deep: &deep {b: {x-in: 2}}\n<<: *deep\nc: x-a\n"
+    )
+    document = read_run_file(path)
+    assert document.data == {"a": {"size": 1}, "b": {"x-in": 2}, "c": "x-a"}
