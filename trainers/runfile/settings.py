@@ -18,6 +18,7 @@ from trainers.common.errors import suggestion
 from trainers.runfile.foreign_keys import foreign_file
 from trainers.runfile.former_keys import brought_up_to_date, tell
 from trainers.runfile.inheritance import read_run_file
+from trainers.runfile.overrides import override
 from trainers.runfile.registry import Registries, Registry, UnknownComponentError
 from trainers.runfile.validation import InvalidError, Model, not_finite, validate
 from trainers.runfile.yaml_document import (
@@ -171,8 +172,7 @@ def load_run_document(
     document: Document, overrides: Sequence[str], registries: Registries
 ) -> RunSettings:
     """Override and validate what a run file says; see `load_run`."""
-    for override in overrides:
-        document.override(override)
+    override(document, overrides, registries)
     return _Sections(document, registries).run()
 
 

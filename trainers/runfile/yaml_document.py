@@ -34,6 +34,9 @@ LARGEST_INTEGER = 2**63 - 1
 MOST_DIGITS = 64
 """Of a whole number, however many zeros it begins with. Python itself refuses thousands."""
 
+COMMAND_LINE = "command line"
+"""Beginning of the place of what was written there."""
+
 TAG = "tag:yaml.org,2002:"
 CORE_SCHEMA = (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
@@ -116,7 +119,7 @@ class Document:
             SettingsError: there is no `=`, VALUE is no YAML, or KEY leads through a value that has
                 no keys or to an item that a list does not have.
         """
-        place = f"command line '{text}'"
+        place = f"{COMMAND_LINE} '{text}'"
         key, equals, value = text.partition("=")
         if not equals or not all(key.split(".")):
             message = "not KEY=VALUE; write for example trainer.max_steps=1000"
