@@ -347,7 +347,7 @@ WRONG = st.sampled_from(
 
 
 @settings(
-    suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=40
+    suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=25
 )
 @given(place=st.sampled_from(PLACES), value=WRONG)
 def test_whatever_stands_there_is_converted_or_refused(

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 import yaml
 
-from trainers.algorithms.ppo import PPOSettings
-from trainers.runfile.foreign_keys import KEYS
+from trainers.runfile.foreign_keys import RL_ZOO
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import SettingsError, load_run
+from trainers.runfile.validation import models_at
 
 GOOD = "environment: {type: gymnasium, id: CartPole-v1}\ntrainer: {trainer_type: ppo}\n"
 
@@ -49,14 +50,18 @@ def test_a_key_of_rl_zoo_is_answered_with_the_right_one(
         assert target in said
 
 
-def test_the_keys_that_are_named_are_there() -> None:
-    known = set(PPOSettings.model_fields)
-    for name in ("hyperparameters", "network_settings"):
-        model = PPOSettings.model_fields[name].annotation
-        known |= set(model.model_fields)  # type: ignore[union-attr]
-    for key in ("n_timesteps", "n_steps", "ent_coef", "clip_range", "vf_coef", "clip_range_vf"):
-        named = KEYS[key].partition("it is ")[2].split(" ")[0].split(",")[0]
-        assert named.split(".")[-1] in known, key
+@pytest.mark.parametrize("said", RL_ZOO.values())
+def test_the_keys_that_are_named_are_there(registries: Registries, said: str) -> None:
+    models = {
+        "environment": [registries.environments.get("gymnasium").settings],
+        "trainer": [registries.trainers.get(name).settings for name in ("ppo", "ddpg")],
+    }
+    for section, dotted in re.findall(r"\b(environment|trainer)\.([\w.]+\w)", said):
+        *around, key = dotted.split(".")
+        owners = [
+            owner for model in models[section] for owner in models_at(model, tuple(around), {})
+        ]
+        assert any(key in owner.model_fields for owner in owners), dotted
 
 
 def test_a_file_of_rl_zoo(tmp_path: Path, registries: Registries) -> None:
