@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 from numpy.typing import NDArray
 
 from encoders.cameras import Pinhole, Sampling
@@ -19,7 +19,7 @@ LARGEST_IMAGE, LARGEST_VECTOR = 2**26, 2**20
 """Values of what has several axes, and of what has one: a shape is not to take all memory."""
 
 
-def space_to_plain(space: gymnasium.Space[Any]) -> Plain:
+def space_to_plain(space: gymnasium.Space[Any]) -> Plain:  # noqa: PLR0911 one a kind
     """A space as JSON can have it; bounds that are all the same become one number.
 
     Raises:
@@ -31,6 +31,14 @@ def space_to_plain(space: gymnasium.Space[Any]) -> Plain:
             return {"type": "dict", "entries": entries}
         case Discrete():
             return {"type": "discrete", "n": int(space.n), "start": int(space.start)}
+        case MultiDiscrete(shape=(_,)):
+            return {
+                "type": "multi_discrete",
+                "nvec": space.nvec.tolist(),
+                "start": space.start.tolist(),
+            }
+        case MultiBinary(shape=(count,)):
+            return {"type": "multi_binary", "n": count}
         case DepthImage():
             height, width, _ = space.shape
             return {
@@ -67,7 +75,7 @@ def space_to_plain(space: gymnasium.Space[Any]) -> Plain:
     raise ValueError(f"the space {space} can't be written: it is of an unknown kind")
 
 
-def space_from_plain(plain: Plain) -> gymnasium.Space[Any]:
+def space_from_plain(plain: Plain) -> gymnasium.Space[Any]:  # noqa: PLR0911 one a kind
     """The space that `space_to_plain` wrote.
 
     Raises:
@@ -88,6 +96,13 @@ def space_from_plain(plain: Plain) -> gymnasium.Space[Any]:
         case "discrete":
             _check_shape([fields["n"]])
             return Discrete(fields["n"], start=fields["start"])
+        case "multi_discrete":
+            _check_shape([len(fields["nvec"])])
+            _check_shape([sum(fields["nvec"])])
+            return MultiDiscrete(fields["nvec"], start=fields["start"])
+        case "multi_binary":
+            _check_shape([fields["n"]])
+            return MultiBinary(fields["n"])
         case "depth_image":
             return _depth_image(fields)
         case "rgb_image":

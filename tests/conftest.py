@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel
 
@@ -269,6 +269,26 @@ class ChoiceEnvironment(ToyEnvironment):
         return (actions != target).astype(float)
 
 
+class ChoicesEnvironment(ToyEnvironment):
+    """Two choices at once, counted from 5 and from 0; the distance is the share of wrong ones."""
+
+    def actions(self) -> MultiDiscrete:
+        return MultiDiscrete([3, 2], start=[5, 0])
+
+    def spaces(self) -> dict[str, Any]:
+        return {"signal": Box(0.0, 1.0, (5,), np.float32)}
+
+    def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        return rng.integers([3, 2], size=(count, 2))
+
+    def show(self, target: np.ndarray) -> dict[str, np.ndarray]:
+        first, second = (np.eye(n, dtype=np.float32)[target[:, i]] for i, n in enumerate((3, 2)))
+        return {"signal": np.concatenate([first, second], axis=1)}
+
+    def distance(self, actions: np.ndarray, target: np.ndarray) -> np.ndarray:
+        return (actions != target + np.array([5, 0])).mean(axis=1)
+
+
 class RecallEnvironment(ChoiceEnvironment):
     """The signal is shown at the first step of an episode alone, and holds for all of them."""
 
@@ -397,6 +417,7 @@ class ToyPlugin:
             "target": TargetEnvironment,
             "darts": DartsEnvironment,
             "choice": ChoiceEnvironment,
+            "choices": ChoicesEnvironment,
             "recall": RecallEnvironment,
             "picture": PictureEnvironment,
         }

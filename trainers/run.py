@@ -385,9 +385,10 @@ def _load(session: Session, resumed: Loaded) -> None:
     """
     state, scoring = resumed.state, Averager()
     own = {"step": 0, SCORING: scoring.state_dict(), **session.state_dict()}
-    if wrong := mismatch(state, own) or mismatch(resumed.weights, session.weights(), "weights"):
+    weights = session.algorithm.policy.current_weights(resumed.weights)
+    if wrong := mismatch(state, own) or mismatch(weights, session.weights(), "weights"):
         raise ValueError(wrong)
-    session.load_state_dict(resumed.weights, state)
+    session.load_state_dict(weights, state)
     check_weights(session.algorithm.policy)
     steps = {state["step"], session.env_runner.step_count, resumed.step}
     if len(steps) > 1:

@@ -23,6 +23,7 @@ from trainers.algorithms.ddpg import DDPGSettings
 from trainers.algorithms.ppo import PPOSettings
 from trainers.algorithms.schedules import Schedule
 from trainers.algorithms.trpo import TRPOSettings
+from trainers.networks.actions import ActionScaling
 from trainers.networks.network import ACTIVATIONS, NetworkSettings
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import RunSettings
@@ -118,7 +119,9 @@ def _on_policy(settings: PPOSettings | TRPOSettings, env: VecEnv) -> dict[str, A
     hyper, networks = settings.hyperparameters, settings.network_settings
     policy = _networks(networks, eps=1e-5)  # their default, which other arguments take away
     if isinstance(env.action_space, gymnasium.spaces.Box):
-        policy["log_std_init"] = math.log(networks.initial_std)
+        # Theirs acts in the environment's units, ours in halves of the distance of its bounds.
+        half_range = ActionScaling(env.action_space, unbounded=True).half_range.mean().item()
+        policy["log_std_init"] = math.log(networks.initial_std * half_range)
     return {
         "learning_rate": _course(hyper.learning_rate, hyper.learning_rate_schedule),
         "n_steps": hyper.buffer_size // env.num_envs,

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from envs.grasp.observations import observation_space
 from envs.grasp.settings import GraspSettings
@@ -16,6 +19,7 @@ from trainers.inference.policy import Policy
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import load_run
 from trainers.runfile.yaml_document import dump, read
+from trainers.session import Session
 
 POLICY = Path(__file__).parents[2] / "policies" / "grasp_gaussian"
 PRESENT = ("motion", "standoff_m", "contact_resolution_m")
@@ -82,3 +86,36 @@ def test_it_is_evaluated_exported_and_loaded(
     image = policies[0].observation_space["depth"].sample()
     actions = [policy.predict({"depth": image})[0] for policy in policies]
     np.testing.assert_array_equal(actions[1:], [actions[0]] * 2)
+
+
+def test_a_gaussian_of_before_goes_on_in_the_environments_units(
+    learn: Callable[..., Any], write_run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pendulum = {"type": "gymnasium", "id": "Pendulum-v1", "num_envs": 2}
+    config = write_run(pendulum, {"max_steps": 128, "network_settings": {"initial_std": 0.5}})
+    scaled = Session.weights
+
+    def weights(session: Session) -> dict[str, torch.Tensor]:
+        """As they were saved before actions were scaled."""
+        names = {"action_model.log_std": "log_std"}
+        own = {name: v for name, v in scaled(session).items() if "action_model.scale" not in name}
+        return {names.get(name, name): values for name, values in own.items()}
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Session, "weights", weights)
+        assert learn(config, "--run-id", "before").code == 0
+    resumed = learn(config, "--run-id", "before", "--resume", "trainer.max_steps=256")
+    assert resumed.code == 0, resumed.errors
+    initialized = learn(config, "--initialize-from", resumed.results / "before")
+    assert initialized.code == 0, initialized.errors
+    assert learn(config, "--run-id", "new").code == 0
+    stds = [
+        Policy.load(resumed.results / run_id).network.exploration_std()
+        for run_id in ("before", "toy", "new")
+    ]
+    torch.testing.assert_close(
+        torch.cat([std for std in stds if std is not None]),
+        torch.tensor([0.5, 0.5, 1.0]),
+        atol=0.05,
+        rtol=0.0,
+    )

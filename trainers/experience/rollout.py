@@ -25,7 +25,7 @@ class Rollout:
         shuffle_groups: the number, from 0, of the group that each belongs to, which stays
             together: the transitions of one frame or, of a policy with memory, of one sequence.
         hidden_states: (M, m) of the policy before each; m is 0 without memory.
-        actions: as the policy drew them, before any clipping.
+        actions: as the policy drew them, before any squashing, scaling and clipping.
         log_probs: of the actions under the policy that drew them.
         values: under the critic of that time.
         advantages: see `trainers.experience.returns.gae`.

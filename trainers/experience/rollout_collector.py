@@ -22,8 +22,20 @@ from trainers.networks.frame_features import FrameFeatures
 from trainers.networks.observations import Observations, frames_differ
 from trainers.networks.recurrent import number_sequences
 
-DistributionAndValues = tuple[Distribution, Tensor]
-"""The distribution that actions (N, ...) were drawn from, and the values (N,) of observations."""
+
+@dataclass(frozen=True)
+class Sampled:
+    """What the policy drew for N observations, beside the actions that come of it.
+
+    Attributes:
+        distribution: that was drawn from.
+        draws: (N, ...) as the distribution knows them.
+        values: (N,) of the observations.
+    """
+
+    distribution: Distribution
+    draws: Tensor
+    values: Tensor
 
 
 @dataclass(frozen=True)
@@ -69,21 +81,21 @@ class SampledActions:
         """See `Behavior.encode_frames`."""
         return self._policy.encode_frames(frames)
 
-    def act(
-        self, observations: Observations, features: FrameFeatures
-    ) -> BehaviorOutput[DistributionAndValues]:
+    def act(self, observations: Observations, features: FrameFeatures) -> BehaviorOutput[Sampled]:
         """See `Behavior.act`."""
         distribution, values, hidden_state = self._policy.step(observations, features)
-        return BehaviorOutput(self._draw(distribution), hidden_state, (distribution, values))
+        draws = self._draw(distribution)
+        actions = self._policy.action_model.actions(draws)
+        return BehaviorOutput(actions, hidden_state, Sampled(distribution, draws, values))
 
     def _draw(self, distribution: Distribution) -> Tensor:
         if self._noise is not None:
-            actions, self._noise = distribution.mode() - self._noise, None
-            return actions
-        actions = distribution.sample(self._generator)
+            draws, self._noise = distribution.mode() - self._noise, None
+            return draws
+        draws = distribution.sample(self._generator)
         if self._antithetic:
-            self._noise = actions - distribution.mode()
-        return actions
+            self._noise = draws - distribution.mode()
+        return draws
 
 
 class RolloutCollector:
@@ -172,21 +184,21 @@ class RolloutCollector:
     def _collect_step(self, frames: FrameStore) -> _RolloutStep:
         """Acts once in every environment."""
         collected = self._collector.collect_step(frames)
-        distribution, values = collected.acted.output
+        sampled = collected.acted.output
         return _RolloutStep(
             frame_index=collected.frame_index,
             vectors=collected.vectors,
             hidden_state=collected.hidden_state,
-            actions=collected.acted.actions,
-            distribution=distribution,
-            values=values,
+            actions=sampled.draws,
+            distribution=sampled.distribution,
+            values=sampled.values,
             final_values=self._final_values(collected),
             reward=collected.step.reward,
             terminated=collected.step.terminated,
             cut_off=collected.step.cut_off,
         )
 
-    def _final_values(self, step: CollectedStep[DistributionAndValues]) -> Tensor:
+    def _final_values(self, step: CollectedStep[Sampled]) -> Tensor:
         hidden_state, collector = step.acted.hidden_state, self._collector
         values = torch.zeros(len(hidden_state), device=self._device)
         cut, final = np.flatnonzero(step.step.cut_off), step.step.final_observations

@@ -14,6 +14,7 @@ from trainers.common.errors import UserError, first_lines
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.network import NetworkSettings
 from trainers.networks.observations import is_frame
+from trainers.networks.policy_network import PolicyNetwork
 from trainers.runfile.registry import Registry
 from trainers.runfile.settings import Component
 from trainers.saving.serialization import mismatch
@@ -62,16 +63,17 @@ def network_factory(
     return factory
 
 
-def load_weights(network: nn.Module, weights: Mapping[str, Tensor]) -> None:
-    """Gives a network saved weights, if they are its own.
+def load_weights(network: PolicyNetwork, weights: Mapping[str, Tensor]) -> None:
+    """Gives a network saved weights, if they are its own, of now or of before.
 
     Raises:
         ValueError: they have other names, shapes or types, or are not finite.
     """
-    if wrong := mismatch(dict(weights), network.state_dict(), "weights"):
+    current = network.current_weights(weights)
+    if wrong := mismatch(current, network.state_dict(), "weights"):
         raise ValueError(wrong)
     try:
-        network.load_state_dict(weights)
+        network.load_state_dict(current)
     except RuntimeError as error:
         raise ValueError(first_lines(error, 3)) from error
     check_weights(network)

@@ -81,8 +81,10 @@ def _scale(policy: RawPolicy, name: str, values: NDArray[Any]) -> NDArray[Any]:
         return np.array([abs(one.high - one.low) for one in policy.meaning.quantities])
     if name == ACTION:
         match policy.action_space:
-            case gymnasium.spaces.Discrete():
+            case gymnasium.spaces.Discrete() | gymnasium.spaces.MultiDiscrete():
                 return np.zeros(())  # another choice is no small difference
+            case gymnasium.spaces.MultiBinary():
+                return np.zeros(())
             case gymnasium.spaces.Box() as box if box.is_bounded():
                 return box.high - box.low
     return np.maximum(np.abs(values), 1.0)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Literal
 
-import gymnasium
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from trainers.common.errors import UserError
-from trainers.networks.distributions import Categorical, DiagonalGaussian, Distribution
+from trainers.networks.action_models import NETWORK_PATH, GaussianSettings, action_model
+from trainers.networks.distributions import Distribution
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.frame_features import FrameFeatures
 from trainers.networks.network import NetworkSettings, head
@@ -23,8 +22,7 @@ from trainers.networks.recurrent import MemorySettings
 
 ACTOR_GAIN = 0.01  # a small last layer: at first every observation gets nearly the same action
 CRITIC_GAIN = 1.0
-NO_LOG_STD = -1000.0  # exp of it is 0
-NETWORK_PATH = "trainer.network_settings"
+FORMER_LOG_STD = "log_std"  # its name in the weights, when Gaussians were not scaled
 
 
 class ActorCriticSettings(NetworkSettings, frozen=True, extra="forbid"):
@@ -42,20 +40,11 @@ class ActorCriticSettings(NetworkSettings, frozen=True, extra="forbid"):
     )
 
 
-class PolicySettings(ActorCriticSettings, frozen=True, extra="forbid"):
+class PolicySettings(GaussianSettings, ActorCriticSettings, frozen=True, extra="forbid"):
     """Networks of the actor and the critic."""
 
     critic: Literal["shared", "separate"] = Field(
         "shared", description="A critic on the actor's hidden vector, or one with its own network."
-    )
-    initial_std: float = Field(
-        1.0, gt=0.0, description="Continuous actions: standard deviation to begin with."
-    )
-    min_std: float = Field(
-        0.001,
-        gt=0.0,
-        description="Continuous actions: the standard deviation never falls below; equal to "
-        "initial_std, it stays there and is not learned.",
     )
     memory: MemorySettings | None = Field(
         None, description="A recurrent layer in the actor and in a separate critic; null: none."
@@ -65,10 +54,6 @@ class PolicySettings(ActorCriticSettings, frozen=True, extra="forbid"):
     def _critic_can_see(self) -> PolicySettings:
         if self.critic == "shared" and self.critic_observations is not None:
             raise ValueError("critic_observations needs critic: separate")
-        if self.min_std > self.initial_std:
-            raise ValueError(
-                f"min_std {self.min_std:g} is over initial_std {self.initial_std:g}: lower it"
-            )
         return self
 
 
@@ -101,24 +86,8 @@ class ActorCritic(PolicyNetwork):
             self.state_size += self.critic.state_size
         self.sequence_length = 1 if settings.memory is None else settings.memory.sequence_length
         width = self.actor.features_dim
-        self.action_head: nn.Linear
-        self.log_std: nn.Parameter | None = None
-        self._min_log_std: Tensor
-        match factory.action_space:
-            case gymnasium.spaces.Box(shape=(size,)):
-                self.action_head = head(width, size, ACTOR_GAIN)
-                above = settings.initial_std - settings.min_std
-                log_std = torch.full((size,), math.log(above) if above else NO_LOG_STD)
-                self.log_std = nn.Parameter(log_std, requires_grad=above > 0)
-            case gymnasium.spaces.Discrete(n=count):
-                self.action_head = head(width, int(count), ACTOR_GAIN)
-            case other:
-                raise UserError(
-                    f"environment: actions of the space {other} are not supported; a Box of one "
-                    "dimension and Discrete are"
-                )
-        min_log_std = torch.tensor(math.log(settings.min_std))
-        self.register_buffer("_min_log_std", min_log_std, persistent=False)
+        self.action_model = action_model(factory.action_space, settings)
+        self.action_head = head(width, self.action_model.outputs, ACTOR_GAIN)
         self.value_head = head(
             width if self.critic is None else self.critic.features_dim, 1, CRITIC_GAIN
         )
@@ -170,11 +139,22 @@ class ActorCritic(PolicyNetwork):
     ) -> Tensor:
         """See `PolicyNetwork.act_on`."""
         distribution = self._distribution(features)
-        return distribution.mode() if deterministic else distribution.sample(generator)
+        draws = distribution.mode() if deterministic else distribution.sample(generator)
+        return self.action_model.actions(draws)
 
     def exploration_std(self) -> Tensor | None:
         """See `PolicyNetwork.exploration_std`."""
-        return None if self.log_std is None else self._log_std(self.log_std).exp()
+        return self.action_model.exploration_std()
+
+    def current_weights(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """See `PolicyNetwork.current_weights`: their Gaussian is in the environment's own units."""
+        current = dict(weights)
+        if FORMER_LOG_STD in current:
+            log_std = current.pop(FORMER_LOG_STD)
+            current["action_model.log_std"] = log_std
+            current["action_model.scale.middle"] = torch.zeros_like(log_std)
+            current["action_model.scale.half_range"] = torch.ones_like(log_std)
+        return current
 
     def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
         """Features of U frames by name, (U, H, W, C)."""
@@ -190,8 +170,7 @@ class ActorCritic(PolicyNetwork):
         """Parameters of the policy; a shared network counts among them."""
         yield from self.actor.parameters()
         yield from self.action_head.parameters()
-        if self.log_std is not None:
-            yield self.log_std
+        yield from self.action_model.parameters()
 
     def critic_parameters(self) -> Iterator[nn.Parameter]:
         """Parameters of the value function alone."""
@@ -200,15 +179,8 @@ class ActorCritic(PolicyNetwork):
         yield from self.value_head.parameters()
 
     def _distribution(self, hidden: Tensor) -> Distribution:
-        outputs = self.action_head(hidden)
-        if self.log_std is None:
-            return Categorical(outputs)
-        return DiagonalGaussian(outputs, self._log_std(self.log_std))
-
-    def _log_std(self, learned: Tensor) -> Tensor:
-        """Logarithms of the standard deviations (A,)."""
-        # std = min_std + exp(learned): a floor that, unlike a clamp, always lets gradients through.
-        return torch.logaddexp(learned, self._min_log_std)
+        distribution: Distribution = self.action_model(self.action_head(hidden))
+        return distribution
 
     def _value(self, hidden: Tensor) -> Tensor:
         value: Tensor = self.value_head(hidden).squeeze(-1)

@@ -162,9 +162,7 @@ class DeterministicPolicy(OffPolicyNetwork):
 
     def exploration_std(self) -> Tensor:
         """See `PolicyNetwork.exploration_std`."""
-        # Half the distance between the bounds is one unit of the network's actions.
-        one = next(self.parameters()).new_ones(self.scale.size)
-        return self._final_sigma * (self.scale(one) - self.scale(0.0 * one))
+        return self._final_sigma * self.scale.half_range
 
     def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
         """See `OffPolicyNetwork.encode_frames`."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor, nn
 
@@ -71,6 +73,13 @@ class PolicyNetwork(nn.Module):
         drawn in another way.
         """
         return None
+
+    def current_weights(self, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Weights that a former version of the network may have saved, as `state_dict` has them.
+
+        Those of the present version, and whatever else they may be, stay as they are.
+        """
+        return dict(weights)
 
     def update_statistics(self, vectors: dict[str, Tensor]) -> None:
         """Shows vector observations (B, n) by name to the encoders that standardise."""

@@ -33,6 +33,7 @@ from trainers.algorithms.trpo import (
 from trainers.common.errors import NonFiniteError
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import concatenate
+from trainers.networks.action_models import GaussianActions
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Categorical, DiagonalGaussian, Distribution
 from trainers.networks.factory import NetworkFactory
@@ -143,10 +144,12 @@ def test_products_are_those_of_the_dense_fisher_matrix(
 def test_the_fisher_matrix_knows_the_spread_and_its_floor(make_factory: MakeFactory) -> None:
     box = Box(-1.0, 1.0, (2,), np.float32)
     policy, observations = small_policy(make_factory, 0, box, initial_std=0.5, min_std=0.2)
-    assert policy.log_std is not None
+    assert isinstance(policy.action_model, GaussianActions)
+    log_std = policy.action_model.log_std
+    assert log_std is not None
     with torch.no_grad():
-        policy.log_std.fill_(math.log(0.3))
-    product = fisher_product(policy.distribution(observations), [policy.log_std], damping=0.0)
+        log_std.fill_(math.log(0.3))
+    product = fisher_product(policy.distribution(observations), [log_std], damping=0.0)
     # std = 0.2 + exp(l), so that d log std / dl = 0.3 / 0.5, and F = 2 (0.3 / 0.5)^2.
     assert product(torch.tensor([1.0, -2.0])).tolist() == pytest.approx([0.72, -1.44])
 

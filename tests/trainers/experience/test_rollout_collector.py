@@ -410,7 +410,7 @@ def test_every_second_step_mirrors_the_noise_of_the_one_before(
     def noise(x: float) -> Tensor:
         observations = Observations({}, {"x": torch.full((500, 1), x)}, None)
         acted = behavior.act(observations, policy.encode_frames({}))
-        return acted.actions - acted.output[0].mode()
+        return acted.output.draws - acted.output.distribution.mode()
 
     with torch.no_grad():
         behavior.begin()

@@ -12,7 +12,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
 
 from encoders.cameras import Pinhole, Sampling
 from encoders.conv import Conv, Paper
@@ -179,6 +179,30 @@ def test_choices_are_the_same(chooser: Any) -> None:
     np.testing.assert_array_equal(told, policy.predict(vectors)[0])
     assert len(set(told.tolist())) > 1
     assert set(told.tolist()) <= {2, 3, 4, 5, 6}
+    with pytest.raises(UserError, match="how its actions were drawn"):
+        file.predict(vectors, deterministic=False)
+
+
+@pytest.mark.parametrize(
+    ("actions", "settings"),
+    [
+        (Box(-400.0, 100.0, (2,)), {"squash": "tanh", "state_dependent_std": True}),
+        (MultiDiscrete([3, 2], start=[5, 0]), {}),
+    ],
+)
+def test_other_actions_are_the_same(
+    make_factory: MakeFactory, actions: Any, settings: dict[str, Any]
+) -> None:
+    policy = policy_of(make_factory, {"vector": EVERYTHING["vector"]}, actions, **settings)
+    raw = fit(policy, Deployment())
+    _, file = exported(policy, raw)
+    rng = np.random.default_rng(0)
+    differences(raw, file, [drawn_inputs(raw, rng) for _ in range(50)], LARGEST_DIFFERENCE)
+    vectors = 5.0 * rng.standard_normal((50, 3)).astype(np.float32)
+    told, _ = file.predict(vectors)
+    np.testing.assert_allclose(told, policy.predict(vectors)[0], rtol=1e-4, atol=1e-3)
+    assert (np.ptp(told, axis=0) > 0).all()
+    assert all(actions.contains(row) for row in told.astype(actions.dtype))
     with pytest.raises(UserError, match="how its actions were drawn"):
         file.predict(vectors, deterministic=False)
 

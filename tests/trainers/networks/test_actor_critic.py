@@ -11,13 +11,14 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, Discrete, MultiDiscrete
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete, Tuple
 from pydantic import ValidationError
 from torch import nn
 
 from encoders.conv import Conv
 from encoders.spaces import RgbImage
 from trainers.common.errors import UserError
+from trainers.networks.action_models import GaussianActions
 from trainers.networks.actions import to_environment
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Categorical, DiagonalGaussian
@@ -49,6 +50,11 @@ def some_observations(count: int, index: torch.Tensor | None = None) -> Observat
 def make_policy(make_factory: MakeFactory, **settings: Any) -> ActorCritic:
     torch.manual_seed(0)
     return ActorCritic(make_factory(SPACE, CONV), PolicySettings(**(SIZES | settings)))
+
+
+def gaussian(policy: ActorCritic) -> GaussianActions:
+    assert isinstance(policy.action_model, GaussianActions)
+    return policy.action_model
 
 
 def replaced(observations: Observations, name: str, by: torch.Tensor) -> Observations:
@@ -120,7 +126,7 @@ def test_actor_and_critic_share_out_all_parameters(
     assert len(both) == len(set(both))
     assert set(both) == {id(parameter) for parameter in policy.parameters()}
     assert any(parameter is policy.value_head.weight for parameter in critic)
-    assert any(parameter is policy.log_std for parameter in actor)
+    assert any(parameter is gaussian(policy).log_std for parameter in actor)
 
 
 @pytest.mark.parametrize("settings", [{}, {"critic": "separate"}])
@@ -216,9 +222,10 @@ def test_continuous_actions_start_near_zero_with_the_asked_for_spread(
 
 def test_the_spread_never_falls_below_its_least(make_factory: MakeFactory) -> None:
     policy = make_policy(make_factory, initial_std=0.5, min_std=0.1)
-    assert policy.log_std is not None
+    learned = gaussian(policy).log_std
+    assert learned is not None
     with torch.no_grad():
-        policy.log_std.fill_(-20.0)
+        learned.fill_(-20.0)
     distribution = policy.distribution(some_observations(2))
     assert isinstance(distribution, DiagonalGaussian)
     assert distribution.log_std.exp().tolist() == pytest.approx([0.1])
@@ -231,8 +238,9 @@ def test_a_spread_that_begins_at_its_least_is_fixed(make_factory: MakeFactory, s
     assert isinstance(distribution, DiagonalGaussian)
     assert torch.equal(distribution.log_std, torch.full((1,), math.log(std)))
     (-distribution.log_prob(torch.ones(2, 1)).mean()).backward()
-    assert policy.log_std is not None
-    assert policy.log_std.grad is None
+    learned = gaussian(policy).log_std
+    assert learned is not None
+    assert learned.grad is None
     assert policy.action_head.weight.grad is not None
 
 
@@ -245,7 +253,7 @@ def test_no_update_moves_a_fixed_spread(
     algorithm.collect()
     statistics = algorithm.update(0.0)
     after = algorithm.policy.state_dict()
-    assert torch.equal(after["log_std"], before["log_std"])
+    assert torch.equal(after["action_model.log_std"], before["action_model.log_std"])
     assert not torch.equal(after["action_head.weight"], before["action_head.weight"])
     # H = A (log sigma + (1 + log 2 pi) / 2) of two dimensions
     entropy = 2 * (math.log(0.3) + (1 + math.log(2 * math.pi)) / 2)
@@ -259,7 +267,6 @@ def test_discrete_actions_start_nearly_uniform(make_factory: MakeFactory) -> Non
     observations = Observations({}, {"joints": torch.randn(6, 3)})
     distribution = policy.distribution(observations)
     assert isinstance(distribution, Categorical)
-    assert policy.log_std is None
     entropy = distribution.entropy()
     assert entropy.shape == (6,)
     assert entropy.min() > math.log(4) - 0.01
@@ -267,12 +274,18 @@ def test_discrete_actions_start_nearly_uniform(make_factory: MakeFactory) -> Non
 
 @pytest.mark.parametrize(
     "space",
-    [Box(-1.0, 1.0, (2, 2), np.float32), Box(-1.0, 1.0, (), np.float32), MultiDiscrete([2])],
+    [
+        Box(-1.0, 1.0, (2, 2), np.float32),
+        Box(-1.0, 1.0, (), np.float32),
+        MultiDiscrete([[2, 3], [4, 5]]),
+        MultiBinary((2, 2)),
+        Tuple([Discrete(2), Discrete(3)]),
+    ],
 )
 def test_other_action_spaces_are_the_users_mistake(
     make_factory: MakeFactory, space: gymnasium.Space[Any]
 ) -> None:
-    with pytest.raises(UserError, match="are not supported; a Box of one dimension and Discrete"):
+    with pytest.raises(UserError, match="are not supported; a Box, a MultiDiscrete"):
         ActorCritic(make_factory({"joints": JOINTS}, action_space=space), PolicySettings(**SIZES))
 
 

@@ -6,7 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import distributions as reference
 
-from trainers.networks.distributions import Categorical, DiagonalGaussian, Distribution
+from trainers.networks.distributions import (
+    Categorical,
+    DiagonalGaussian,
+    Distribution,
+    MultiCategorical,
+    TanhGaussian,
+)
 
 
 def gaussian(seed, rows=7, actions=3, *, shared=False, scale=1.0):
@@ -19,6 +25,14 @@ def gaussian(seed, rows=7, actions=3, *, shared=False, scale=1.0):
 def categorical(seed, rows=7, choices=4, *, scale=1.0):
     draw = torch.Generator().manual_seed(seed)
     return Categorical(scale * torch.randn(rows, choices, generator=draw, dtype=torch.float64))
+
+
+def squashed(seed, **options):
+    return TanhGaussian(**vars(gaussian(seed, **options)))
+
+
+def choices(seed, rows=7, sizes=(2, 3), *, scale=1.0):
+    return MultiCategorical(categorical(seed, rows, sum(sizes), scale=scale).logits, sizes)
 
 
 def torch_gaussian(ours):
@@ -39,6 +53,13 @@ PAIRS = [
     pytest.param(gaussian(1, shared=True), gaussian(2, shared=True), id="gaussian-shared"),
     pytest.param(gaussian(1, shared=True), gaussian(2), id="gaussian-mixed"),
     pytest.param(categorical(1), categorical(2), id="categorical"),
+]
+
+EVERY_PAIR = [
+    *PAIRS,
+    pytest.param(squashed(1), squashed(2), id="tanh"),
+    pytest.param(squashed(1, shared=True), squashed(2, shared=True), id="tanh-shared"),
+    pytest.param(choices(1), choices(2), id="choices"),
 ]
 
 
@@ -105,7 +126,7 @@ def test_categorical_by_hand():
     assert p.mode().tolist() == [0]
 
 
-@pytest.mark.parametrize(("p", "q"), PAIRS)
+@pytest.mark.parametrize(("p", "q"), EVERY_PAIR)
 def test_entropy_and_kl_are_the_means_they_stand_for(p: Distribution, q: Distribution):
     draw = torch.Generator().manual_seed(3)
     count = 20_000
@@ -135,7 +156,10 @@ def test_categorical_samples_have_its_frequencies():
     torch.testing.assert_close(actions.bincount() / 50_000, wanted, atol=0.01, rtol=0)
 
 
-@pytest.mark.parametrize("p", [gaussian(1), gaussian(1, shared=True), categorical(1, rows=50)])
+@pytest.mark.parametrize(
+    "p",
+    [gaussian(1), gaussian(1, shared=True), categorical(1, rows=50), choices(1, 50), squashed(1)],
+)
 def test_sampling_uses_the_generator_given_and_no_other(p: Distribution):
     before = torch.random.get_rng_state()
     first = p.sample(torch.Generator().manual_seed(5))
@@ -157,14 +181,19 @@ def test_without_a_generator_torchs_own_is_used():
 
 def test_no_gradient_flows_through_a_sample_and_detach_cuts_the_rest():
     parameters = torch.nn.Parameter(torch.zeros(2, 3))
-    for p in (DiagonalGaussian(parameters, parameters), Categorical(parameters)):
+    for p in (
+        DiagonalGaussian(parameters, parameters),
+        TanhGaussian(parameters, parameters),
+        Categorical(parameters),
+        MultiCategorical(parameters, (1, 2)),
+    ):
         assert not p.sample().requires_grad
         assert p.entropy().requires_grad
         assert not p.detach().entropy().requires_grad
         assert torch.equal(p.detach().entropy(), p.entropy())
 
 
-@pytest.mark.parametrize(("p", "q"), PAIRS)
+@pytest.mark.parametrize(("p", "q"), EVERY_PAIR)
 @pytest.mark.parametrize(
     "rows",
     [
@@ -181,7 +210,7 @@ def test_rows(p: Distribution, q: Distribution, rows):
     assert p[rows].entropy().shape == (3,)
 
 
-@pytest.mark.parametrize(("p", "q"), PAIRS)
+@pytest.mark.parametrize(("p", "q"), EVERY_PAIR)
 def test_rows_come_together_again(p: Distribution, q: Distribution):
     count = len(p.mode())
     for distribution in (p, q):
@@ -191,6 +220,64 @@ def test_rows_come_together_again(p: Distribution, q: Distribution):
         assert len(whole.mode()) == count
         assert torch.equal(whole.mode(), distribution.mode())
         assert torch.equal(whole.log_prob(actions), distribution.log_prob(actions))
+
+
+def density(p: TanhGaussian, actions: torch.Tensor) -> torch.Tensor:
+    """Densities (n,) of actions (n,) of one row in one dimension."""
+    return p[torch.zeros(len(actions), dtype=int)].log_prob(actions.atanh()[:, None]).exp()
+
+
+@pytest.mark.parametrize("std", [0.3, 1.0])
+@pytest.mark.parametrize("mean", [-1.5, 0.0, 0.4])
+def test_a_squashed_density_is_one_of_actions(mean, std):
+    p = TanhGaussian(torch.tensor([[mean]]).double(), torch.tensor([std]).double().log())
+    actions = torch.linspace(-1.0, 1.0, 400_001, dtype=torch.float64)[1:-1]
+    values = density(p, actions)
+    assert torch.trapezoid(values, actions).item() == pytest.approx(1.0, abs=1e-6)
+    surprise = torch.trapezoid(-torch.special.xlogy(values, values), actions).item()
+    assert p.entropy().item() == pytest.approx(surprise, abs=1e-5)
+    below = torch.trapezoid(values[actions <= 0.2], actions[actions <= 0.2]).item()
+    expected = torch.special.ndtr((math.atanh(0.2) - p.mean) / std).item()
+    assert below == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_squashed_density_agrees_with_torch_distributions():
+    p = squashed(1)
+    u = p.sample(torch.Generator().manual_seed(0))
+    normal = reference.Independent(reference.Normal(p.mean, p.log_std.exp()), 1)
+    theirs = reference.TransformedDistribution(normal, reference.transforms.TanhTransform())
+    torch.testing.assert_close(p.log_prob(u), theirs.log_prob(u.tanh()))
+
+
+def test_a_wide_gaussian_squashed_is_nearly_uniform_and_never_wider():
+    log_stds = torch.linspace(-2.0, 1.0, 301)[:, None]
+    entropies = TanhGaussian(torch.zeros(301, 1), log_stds).entropy()
+    assert entropies.max() < math.log(2.0)
+    assert entropies.max() == pytest.approx(math.log(2.0), abs=0.02)
+
+
+def test_what_is_squashed_stays_known_where_its_tanh_is_1():
+    p = TanhGaussian(torch.tensor([[8.0]]), torch.zeros(1))
+    u = torch.tensor([[20.0]], requires_grad=True)
+    # log N = -12^2 / 2 - log(2 pi) / 2, log slope = 2 log 2 - 40
+    assert p.log_prob(u).item() == pytest.approx(-72.0 - 0.9189385 - 1.3862944 + 40.0, abs=1e-4)
+
+
+def test_several_choices_are_one_between_all_their_combinations():
+    p, q = choices(1), choices(2)
+
+    def joint(several):
+        first, second = several.logits.split(several.sizes, 1)
+        return Categorical((first[:, :, None] + second[:, None, :]).flatten(1))
+
+    actions = q.sample(torch.Generator().manual_seed(0))
+    assert actions.shape == (7, 2)
+    assert {actions[:, 0].max().item(), actions[:, 1].max().item()} == {1, 2}
+    combined = 3 * actions[:, 0] + actions[:, 1]
+    torch.testing.assert_close(p.log_prob(actions), joint(p).log_prob(combined))
+    torch.testing.assert_close(p.entropy(), joint(p).entropy())
+    torch.testing.assert_close(p.kl(q), joint(p).kl(joint(q)))
+    assert torch.equal(3 * p.mode()[:, 0] + p.mode()[:, 1], joint(p).mode())
 
 
 def test_as_many_rows_as_dimensions_is_not_mistaken_for_shared():
