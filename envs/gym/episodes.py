@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import traceback
+from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
@@ -166,6 +167,51 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
             f"environment {self._index} of {self._name!r} failed in {call} of its episode "
             f"{self._begun}: {reason}"
         )
+
+
+class StackedEpisodes(RepeatableEpisodes):
+    """The same, with the latest observations in the place of the last.
+
+    What is observed is a tuple, the oldest first; an episode's first observation stands for those
+    that would be before it.
+
+    Args:
+        env: the environment.
+        name: for messages.
+        run_seed: of the run.
+        index: which of the run's environments it is, from 0.
+        frame_stack: how many observations.
+        with_infos: see `RepeatableEpisodes`.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        name: str,
+        run_seed: int,
+        index: int,
+        frame_stack: int,
+        *,
+        with_infos: bool = False,
+    ):
+        super().__init__(env, name, run_seed, index, with_infos=with_infos)
+        self._frames: deque[Any] = deque(maxlen=frame_stack)
+        self._frame_stack = frame_stack
+        self.observation_space = gymnasium.spaces.Tuple([self._space] * frame_stack)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """See `RepeatableEpisodes`."""
+        observation, info = super().reset(seed=seed, options=options)
+        self._frames.extend([observation] * self._frame_stack)
+        return tuple(self._frames), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """See `RepeatableEpisodes`."""
+        observation, *rest = super().step(action)
+        self._frames.append(observation)
+        return tuple(self._frames), *rest
 
 
 def _copied(observation: Any) -> Any:

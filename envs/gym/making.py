@@ -10,7 +10,7 @@ import gymnasium
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from envs.environment import EnvironmentFailure
-from envs.gym.episodes import RepeatableEpisodes
+from envs.gym.episodes import RepeatableEpisodes, StackedEpisodes
 from envs.gym.processes import ProcessVectorEnv
 from envs.gym.settings import GymSettings
 from envs.gym.spaces import WRAP, flattens
@@ -83,8 +83,10 @@ def _flattened(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
 def _make_one(
     settings: GymSettings, seed: int, index: int, with_infos: bool
 ) -> gymnasium.Env[Any, Any]:
-    env = make(settings)
-    return RepeatableEpisodes(env, settings.id, seed, index, with_infos=with_infos)
+    env, which = make(settings), (settings.id, seed, index)
+    if settings.frame_stack > 1:
+        return StackedEpisodes(env, *which, settings.frame_stack, with_infos=with_infos)
+    return RepeatableEpisodes(env, *which, with_infos=with_infos)
 
 
 def _nearest(name: str) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Dict
+from gymnasium.spaces import Box, Dict, Tuple
 from numpy.typing import NDArray
 
 RESET = "(observation, info)"
@@ -76,6 +76,11 @@ def check_observation(
                     keys = f"{list(space.spaces)}, and {key!r} is missing"
                     raise WrongReturn(f"{name} has the keys {list(value)}, and should have {keys}")
                 check_observation(part, value[key], f"the observation {key!r}")
+        case Tuple():
+            if not isinstance(value, tuple | list) or len(value) != len(space.spaces):
+                raise _wrong(name, value, f"a tuple of {len(space.spaces)}")
+            for index, part in enumerate(space.spaces):
+                check_observation(part, value[index], f"the observation {index}")
         case _ if not space.contains(value):
             raise _wrong(name, value, f"of {space}")
 

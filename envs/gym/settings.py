@@ -35,8 +35,15 @@ class GymSettings(BaseModel, frozen=True, extra="forbid"):
     )
     channels: Literal["first", "last"] | None = Field(
         None,
-        description="Which axis of images has the channels; null: the last, which has to be the "
-        "shortest then.",
+        description="Which axis of images has the channels; null: the first or the last, whichever "
+        "is shorter than the others.",
+    )
+    frame_stack: int = Field(
+        1,
+        ge=1,
+        le=64,
+        description="The latest observations that are seen as one, the oldest first: images along "
+        "their channels, vectors end to end. An episode's first stands for those before it.",
     )
     kwargs: dict[str, Any] = Field(
         default_factory=dict, description="What else gymnasium.make is given."

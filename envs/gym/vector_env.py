@@ -63,7 +63,7 @@ class GymEnvironment(Environment):
         self._vector = make_vector_env(settings, seed, with_infos=bool(rewards))
         try:
             self._observe = ObservationAdapter(
-                self._vector.single_observation_space, settings.channels
+                self._vector.single_observation_space, settings.channels, settings.frame_stack
             )
             self._act = ActionAdapter(self._vector.single_action_space)
         except ValueError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 import yaml
-from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, Tuple
 
 from encoders.cameras import Pinhole
 from encoders.spaces import DepthImage
@@ -181,6 +181,65 @@ def test_own_cameras_are_seen_as_those_of_the_grasp_task(
     finally:
         del gymnasium.registry["ventosa_tests/Cameras-v0"]
     assert report["success"] == 1.0
+
+
+class Switches(gymnasium.Env[Any, Any]):
+    """Nested observations of what was just done; each switch that is on pays, where it was off."""
+
+    observation_space = Dict({"was": Tuple([MultiBinary(3), Dict({"steps": Discrete(9)})])})
+    action_space = MultiBinary(3)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps, self.on = 0, self.np_random.integers(2, size=3, dtype=np.int8)
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        assert self.action_space.contains(action)
+        self.steps += 1
+        reward = float((action != self.on).mean())
+        self.on = action.copy()
+        return self._observation(), reward, False, self.steps == 8, {}
+
+    def _observation(self) -> dict[str, Any]:
+        return {"was": (self.on, {"steps": self.steps})}
+
+
+@pytest.fixture
+def switches() -> Iterator[dict[str, Any]]:
+    name = "ventosa_tests/Switches-v0"
+    gymnasium.register(name, entry_point=Switches)
+    yield {"type": "gymnasium", "id": name, "num_envs": 8}
+    del gymnasium.registry[name]
+
+
+def test_nested_observations_of_several_steps_and_switches_are_learned(
+    switches: dict[str, Any], learn: Learn, write_run: WriteRun
+) -> None:
+    hyper = {"buffer_size": 256, "batch_size": 64, "learning_rate": 1e-2, "num_epoch": 4}
+    trainer = {
+        "max_steps": 4096,
+        "hyperparameters": {**hyper, "gamma": 0.0, "beta": 0.0},
+        "network_settings": {"hidden_units": 32},
+    }
+    learned = learn(write_run({**switches, "frame_stack": 2}, trainer))
+    assert learned.code == 0, learned.errors
+    policy = Policy.load(str(learned.results / "toy"))
+    assert policy.action_space == MultiBinary(3)
+    assert {k: s.shape for k, s in policy.observation_space.spaces.items()} == {
+        "was.0": (6,),
+        "was.1.steps": (18,),
+    }
+    report = evaluate(str(learned.results / "toy"), episodes=4).report
+    assert report["reward"] > 7.0  # of 8; 4 by chance
+
+
+def test_who_can_not_act_in_a_space_says_so(
+    switches: dict[str, Any], learn: Learn, write_run: WriteRun
+) -> None:
+    told = learn(write_run(switches, {"trainer_type": "ddpg"}))
+    assert told.code == 2
+    assert "this environment's are MultiBinary(3); use trainer_type: ppo" in told.errors
 
 
 def test_it_learns_to_balance_a_pole(make_session: Callable[..., Session]) -> None:

@@ -14,6 +14,7 @@ from gymnasium.spaces import (
     Graph,
     MultiBinary,
     MultiDiscrete,
+    OneOf,
     Sequence,
     Text,
     Tuple,
@@ -85,6 +86,76 @@ def test_a_choice_is_seen_as_one_of_many() -> None:
     assert seen.tolist() == [[0, 1, 0], [1, 0, 0], [0, 0, 1], [0, 0, 1]]
 
 
+def test_several_choices_are_seen_end_to_end() -> None:
+    adapter = ObservationAdapter(MultiDiscrete([[3, 2]], start=[[5, 0]]))
+    seen = adapter(np.array([[[5, 1]], [[7, 0]]]))["observation"]
+    assert seen.tolist() == [[1, 0, 0, 0, 1], [0, 0, 1, 1, 0]]
+    seen = ObservationAdapter(MultiBinary((2, 2)))(np.array([[[1, 0], [0, 1]]], np.int8))
+    assert seen["observation"].tolist() == [[1, 0, 0, 1]]
+    assert seen["observation"].dtype == np.float32
+
+
+NESTED = Dict(
+    {
+        "arm": Tuple([Box(-1.0, 1.0, (2,), np.float32), Dict({"grip": Discrete(2)})]),
+        "a.b": MultiBinary(3),
+    }
+)
+
+
+def test_what_is_nested_is_called_by_the_way_there() -> None:
+    adapter = ObservationAdapter(NESTED)
+    assert set(adapter.space.spaces) == {"arm.0", "arm.1.grip", "a.b"}
+    batched = batch_space(NESTED, 2)
+    batched.seed(0)
+    batch: Any = batched.sample()
+    seen = adapter(batch)
+    assert batch_space(adapter.space, 2).contains(seen)
+    np.testing.assert_array_equal(seen["arm.0"], batch["arm"][0])
+    np.testing.assert_array_equal(seen["arm.1.grip"].argmax(1), batch["arm"][1]["grip"])
+    assert set(ObservationAdapter(Tuple([Discrete(2), Discrete(3)])).space.spaces) == {"0", "1"}
+
+
+@pytest.mark.parametrize(
+    ("space", "names"),
+    [
+        (Dict({"a": Dict({"b": Discrete(2)}), "a.b": Discrete(2)}), r"\['a', 'b'\] and \['a.b'\]"),
+        (Dict({"0": Tuple([Discrete(2)]), "0.0": Discrete(2)}), r"\['0', 0\] and \['0.0'\]"),
+    ],
+)
+def test_two_observations_of_one_name_are_refused(space: gymnasium.Space[Any], names: str) -> None:
+    with pytest.raises(ValueError, match=f"{names} have the same name, '.*': to call one another"):
+        ObservationAdapter(space)
+
+
+def test_stacked_observations_are_joined_the_oldest_first() -> None:
+    parts = {
+        "vector": Box(np.float32([-1, -2]), np.float32([1, 2])),
+        "view": Box(0, 255, (3, 4, 5), np.uint8),
+        "choice": Discrete(2),
+    }
+    space = Dict(parts)
+    adapter = ObservationAdapter(Tuple([space] * 3), "first", frame_stack=3)
+    assert adapter.space["vector"].high.tolist() == [1, 2, 1, 2, 1, 2]  # type: ignore[attr-defined]
+    assert adapter.space["view"] == Box(0, 255, (4, 5, 9), np.uint8)
+    batched = batch_space(Tuple([space] * 3), 2)
+    batched.seed(0)
+    frames: Any = batched.sample()
+    seen = adapter(frames)
+    assert batch_space(adapter.space, 2).contains(seen)
+    for place, frame in enumerate(frames):
+        view = seen["view"][..., 3 * place : 3 * place + 3]
+        np.testing.assert_array_equal(view, np.moveaxis(frame["view"], 1, -1))
+        vector = seen["vector"][:, 2 * place : 2 * place + 2]
+        np.testing.assert_array_equal(vector, frame["vector"])
+
+
+@pytest.mark.parametrize("space", [DepthImage(8, 9), RgbImage(2, 3), PointCloud(4)])
+def test_images_of_cameras_are_not_stacked(space: gymnasium.Space[Any]) -> None:
+    with pytest.raises(ValueError, match=r"frame_stack: observation 'observation'.*memory"):
+        ObservationAdapter(Tuple([space] * 2), frame_stack=2)
+
+
 def test_arrays_are_new_even_where_nothing_changes() -> None:
     pixels = np.zeros((2, 6, 5, 3), np.uint8)
     numbers = np.zeros((2, 4), np.float32)
@@ -98,12 +169,10 @@ def test_arrays_are_new_even_where_nothing_changes() -> None:
 @pytest.mark.parametrize(
     ("space", "what"),
     [
-        (Tuple([Discrete(2), Discrete(3)]), "Tuple"),
         (Text(5), "Text"),
-        (MultiDiscrete([2, 3]), "MultiDiscrete"),
-        (MultiBinary(4), "MultiBinary"),
+        (OneOf([Discrete(2), Discrete(3)]), "OneOf"),
         (Box(0.0, 1.0, (4, 5)), r"Box\(0.0, 1.0, \(4, 5\)"),
-        (Dict({"inner": Box(0.0, 1.0, (2,))}), "Dict"),
+        (Box(0.0, 1.0, (4, 5, 6, 7)), r"Box\(0.0, 1.0, \(4, 5, 6, 7\)"),
     ],
 )
 def test_what_no_encoder_takes_is_named_with_a_way_out(
@@ -135,7 +204,7 @@ def test_images_of_cameras_stay_what_they_are(channels: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "shape", [(3, 84, 84), (2, 84, 84), (24, 84, 84), (5, 5, 17), (84, 84, 84), (4, 3, 3)]
+    "shape", [(5, 5, 17), (84, 84, 84), (4, 3, 3), (84, 3, 84), (3, 3, 84), (84, 3, 3)]
 )
 def test_a_shape_that_does_not_tell_the_channels_asks_for_them(shape: Any) -> None:
     space = Box(0, 255, shape, np.uint8)
@@ -144,7 +213,21 @@ def test_a_shape_that_does_not_tell_the_channels_asks_for_them(shape: Any) -> No
     assert ObservationAdapter(space, "last").space["observation"] == space
     first = ObservationAdapter(space, "first").space["observation"]
     assert first.shape == (*shape[1:], shape[0])
-    ObservationAdapter(Box(0, 255, (4, 84, 3), np.uint8))  # four rows
+
+
+@pytest.mark.parametrize(
+    ("shape", "seen"),
+    [
+        ((3, 84, 84), (84, 84, 3)),
+        ((24, 84, 80), (84, 80, 24)),
+        ((1, 5, 17), (5, 17, 1)),
+        ((84, 80, 3), (84, 80, 3)),
+        ((4, 84, 3), (4, 84, 3)),  # four rows
+    ],
+)
+def test_the_shortest_axis_has_the_channels(shape: Any, seen: Any) -> None:
+    space = Box(0, 255, shape, np.uint8)
+    assert ObservationAdapter(space).space["observation"].shape == seen
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float64])
@@ -158,10 +241,24 @@ def test_channels_that_come_first_are_put_last_with_their_bounds(dtype: Any) -> 
     assert (adapter.space["observation"].high[2, 3] == [10, 200]).all()  # type: ignore[attr-defined]
 
 
-def test_a_choice_of_action_is_counted_from_zero() -> None:
-    adapter = ActionAdapter(Discrete(3, start=-1))
-    assert adapter.space == Discrete(3)
-    assert adapter(np.array([0, 2, 1])).tolist() == [-1, 1, 0]
+@pytest.mark.parametrize(
+    ("space", "actions"),
+    [
+        (Discrete(3, start=-1), [-1, 1, 0]),
+        (MultiDiscrete([3, 2], start=[1, 0]), [[1, 0], [3, 1]]),
+        (MultiBinary(2), [[1, 0], [0, 1]]),
+    ],
+)
+def test_discrete_actions_have_the_type_of_their_space(
+    space: gymnasium.Space[Any], actions: Any
+) -> None:
+    adapter = ActionAdapter(space)
+    assert adapter.space is space
+    given = np.array(actions, np.int64)
+    taken = adapter(given)
+    assert taken.dtype == space.dtype
+    assert not np.shares_memory(taken, given)
+    assert taken.tolist() == actions
 
 
 @pytest.mark.parametrize("bounds", [(-2.0, 2.0), (0.0, 3.5), (-np.inf, np.inf)])
@@ -177,8 +274,17 @@ def test_continuous_actions_stay_as_they_are(bounds: tuple[float, float]) -> Non
 
 
 @pytest.mark.parametrize(
-    "space", [MultiDiscrete([2, 3]), Box(0.0, 1.0, (2, 2)), Box(0, 5, (2,), np.int64), Text(3)]
+    "space",
+    [
+        MultiDiscrete([[2, 3]]),
+        MultiBinary((2, 2)),
+        Box(0.0, 1.0, (2, 2)),
+        Box(0, 5, (2,), np.int64),
+        Text(3),
+        Tuple([Discrete(2), Discrete(3)]),
+        Dict({"move": Discrete(2)}),
+    ],
 )
 def test_what_no_policy_acts_in_is_named(space: gymnasium.Space[Any]) -> None:
-    with pytest.raises(ValueError, match=f"{type(space).__name__}.*a Box of one dimension.*Discre"):
+    with pytest.raises(ValueError, match=f"{type(space).__name__}.*a Box with floats"):
         ActionAdapter(space)

@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Dict, Discrete, Sequence
+from gymnasium.spaces import Box, Dict, Discrete, Sequence, Text
 
 from envs.environment import EnvironmentFailure
 from envs.gym import vector_env
@@ -108,7 +108,7 @@ def test_it_does_what_the_environments_do_one_by_one(vectorization: str) -> None
             observations, reward, terminated, truncated, infos = env.step(actions)
             assert env.observation_space.contains(observations)
             for i, room in enumerate(alone):
-                expected[i], *rest, _ = room.step(np.int64(actions[i] + 1))
+                expected[i], *rest, _ = room.step(np.int64(actions[i]))
                 assert (reward[i], terminated[i], truncated[i]) == tuple(rest)
                 if any(rest[1:]):
                     assert infos["_final_obs"][i]
@@ -125,6 +125,31 @@ def test_it_does_what_the_environments_do_one_by_one(vectorization: str) -> None
                 )
                 assert observations["door"][i].argmax() == expected[i]["door"]
         assert min(begun) > 5
+
+
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+def test_the_latest_observations_are_seen_as_one(vectorization: str) -> None:
+    with (
+        closing(make(vectorization=vectorization, frame_stack=3)) as env,
+        closing(make()) as alone,
+    ):
+        one, _ = alone.reset()
+        seen, _ = env.reset()
+        past = {name: [values] * 3 for name, values in one.items()}
+        for actions in actions_for(env, 30):
+            assert env.observation_space.contains(seen)
+            assert_same(seen, {k: np.concatenate(v, axis=-1) for k, v in past.items()})
+            seen, *_, infos = env.step(actions)
+            one, *_, expected = alone.step(actions)
+            ended = expected.get("_final_obs", np.zeros(3, bool))
+            for name, now in one.items():
+                frames = past[name]
+                if ended.any():
+                    last = np.concatenate([*frames[1:], expected["final_obs"][name]], axis=-1)
+                    assert_same(infos["final_obs"][name][ended], last[ended])
+                past[name] = [*frames[1:], now]
+                for frame in frames[1:]:  # of the episodes before
+                    frame[ended] = now[ended]
 
 
 def test_every_episode_has_a_seed_of_its_own() -> None:
@@ -163,6 +188,7 @@ def test_a_seed_given_to_reset_begins_anew() -> None:
     [
         ("ventosa_tests/Room-v0", "sync", None),
         ("ventosa_tests/Room-v0", "async", None),
+        ("Blackjack-v1", "sync", None),
         ("Pendulum-v1", "sync", None),
         ("CartPole-v1", "sync", None),
         ("CartPole-v1", "async", None),
@@ -190,6 +216,16 @@ def test_going_back_to_a_state_goes_on_to_the_last_bit(
             assert_same(env.step(now), other.step(now))
         assert_same(env.state_dict(), other.state_dict())
     assert not caplog.records
+
+
+def test_going_back_brings_back_the_observations_before_the_last() -> None:
+    with closing(make(frame_stack=4)) as env, closing(make(frame_stack=4)) as other:
+        *before, after = actions_for(env, 12)
+        env.reset()
+        for actions in before:
+            seen = env.step(actions)[0]
+        assert_same(other.load_state_dict(env.state_dict()), seen)
+        assert_same(other.step(after), env.step(after))
 
 
 def assert_same(one: Any, other: Any) -> None:
@@ -338,14 +374,22 @@ def test_what_gymnasium_can_not_flatten_or_put_side_by_side_is_named() -> None:
             {"id": "Pendulum-v1", "kwargs": {"gravity": 1}},
             r"'Pendulum-v1' can't be made with kwargs \{'gravity': 1\}: .*argument 'gravity'",
         ),
-        ({"id": "Blackjack-v1"}, r"no encoder takes the space Tuple.*flatten_observations: true"),
+        (
+            {"id": "ventosa_tests/Text-v0"},
+            r"'word': no encoder takes the space Text.*flatten_observations: true",
+        ),
     ],
 )
 def test_what_can_not_be_made_is_the_users_mistake(
     settings: dict[str, Any], message: str, vectorization: Any
 ) -> None:
-    with pytest.raises(ValueError, match=message):
-        GymEnvironment(GymSettings(vectorization=vectorization, **settings), [])
+    spaces = {"space": Dict({"word": Text(3)})}
+    gymnasium.register("ventosa_tests/Text-v0", entry_point=Differing, kwargs=spaces)
+    try:
+        with pytest.raises(ValueError, match=message):
+            GymEnvironment(GymSettings(vectorization=vectorization, **settings), [])
+    finally:
+        del gymnasium.registry["ventosa_tests/Text-v0"]
 
 
 @pytest.mark.parametrize(
@@ -418,10 +462,10 @@ def test_a_reward_sees_what_one_environment_by_itself_does(vectorization: Any) -
         room, begun, ends = Room(), 0, 0
         before, _ = room.reset(seed=episode_seed(7, i, begun))
         for shown, now in zip(diary.shown, actions, strict=True):
-            after, reward, terminated, truncated, info = room.step(np.int64(now[i] + 1))
+            after, reward, terminated, truncated, info = room.step(np.int64(now[i]))
             np.testing.assert_array_equal(shown.observations["view"][i], before["view"])
             np.testing.assert_array_equal(shown.next_observations["view"][i], after["view"])
-            assert shown.actions[i] == now[i] + 1  # as the environment counts them
+            assert shown.actions[i] == now[i]  # as the environment counts them
             assert (shown.rewards[i], shown.terminated[i], shown.truncated[i]) == (
                 reward,
                 terminated,

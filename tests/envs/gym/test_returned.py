@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 from envs.gym.returned import WrongReturn, check_observation, checked_reset, checked_step
 
 VECTOR = Box(-1.0, 1.0, (2,), np.float32)
 BYTES = Box(0, 255, (1, 2, 3), np.uint8)
+PAIR = Tuple([Discrete(3), VECTOR])
 BOTH = Dict({"x": VECTOR, "door": Discrete(3, start=1)})
 
 
@@ -25,6 +26,7 @@ BOTH = Dict({"x": VECTOR, "door": Discrete(3, start=1)})
         (Box(-1.0, 1.0, ()), 0.5),
         (Discrete(3, start=1), np.int64(3)),
         (BOTH, {"x": np.zeros(2), "door": 1, "more": None}),
+        (PAIR, (1, np.zeros(2))),
     ],
 )
 def test_what_becomes_an_observation_is_taken(space: Any, value: Any) -> None:
@@ -46,6 +48,9 @@ def test_what_becomes_an_observation_is_taken(space: Any, value: Any) -> None:
                                    "'x'], and 'door' is missing"),
         (BOTH, {"x": np.zeros(2), "door": 0}, "the observation 'door' is 0 (int), and should be of "
                                               "Discrete(3, start=1)"),
+        (PAIR, (1, np.zeros(3)), "the observation 1 is an array of float64 (3,), and should be an "
+                                 "array of float32 (2,)"),
+        (PAIR, (1,), "the observation is a tuple of 1, and should be a tuple of 2"),
         (BOTH, 1.0, "the observation is 1.0 (float), and should be a dictionary with the keys "
                     "['door', 'x']"),
     ],
