@@ -619,10 +619,18 @@ def test_it_learns_to_hit_a_point(make_trpo: MakeTRPO, privileged: bool) -> None
     assert last > -0.25
 
 
-def test_it_learns_to_choose(make_trpo: MakeTRPO) -> None:
-    environment = {"type": "choice", "num_envs": 16}
+def test_it_learns_to_hit_a_point_with_a_squashed_gaussian(make_trpo: MakeTRPO) -> None:
+    network = {"hidden_units": 32, "initial_std": 0.5, "squash": "tanh"}
+    first, last = learned(make_trpo({"type": "target", "num_envs": 16}, BIG, network), 30)
+    assert first < -0.6
+    assert last > -0.25
+
+
+@pytest.mark.parametrize("kind", ["choice", "choices"])
+def test_it_learns_to_choose(make_trpo: MakeTRPO, kind: str) -> None:
+    environment = {"type": kind, "num_envs": 16}
     first, last = learned(make_trpo(environment, BIG), 15)
-    assert first < -0.5  # two wrong of three
+    assert first < -0.5  # two wrong of three, or of three and of two in the mean
     assert last > -0.05
 
 
