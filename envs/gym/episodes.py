@@ -199,11 +199,10 @@ class StackedEpisodes(RepeatableEpisodes):
         self._frame_stack = frame_stack
         self.observation_space = gymnasium.spaces.Tuple([self._space] * frame_stack)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    def _begin(
+        self, drawn: Mapping[str, float], options: dict[str, Any] | None
     ) -> tuple[Any, dict[str, Any]]:
-        """See `RepeatableEpisodes`."""
-        observation, info = super().reset(seed=seed, options=options)
+        observation, info = super()._begin(drawn, options)
         self._frames.extend([observation] * self._frame_stack)
         return tuple(self._frames), info
 
