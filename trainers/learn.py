@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import signal
 import socket
 import sys
@@ -16,9 +15,7 @@ from typing import Any
 
 from trainers.common import process, stopping
 from trainers.common.command import DONE, INTERRUPTED, TERMINATED, tells_failures
-from trainers.common.errors import UserError
 from trainers.common.options import add_results_option, command_parser, version
-from trainers.common.origin import PACKAGES
 
 ASKING_TO_STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -27,8 +24,6 @@ ASKING_TO_STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Trains as the run file says; returns the exit code."""
     options = parse(arguments)
-    if shadowed := shadowed_packages():
-        raise UserError(shadowed)
     process.prepare()
     # Imported late, so that `--help` and a mistyped option answer at once.
     # And so does the line that says that something happens.
@@ -146,21 +141,6 @@ def _answer(heard: socket.socket) -> None:
             name = signal.Signals(number[0]).name
             print(f"{name}: stopping, and saving first; once more stops at once", file=sys.stderr)
             return
-
-
-def shadowed_packages() -> str | None:
-    """Message if another distribution's package hides one of ours; None if nothing is."""
-    home = Path(__file__).resolve().parents[1]
-    for package in PACKAGES:
-        spec = importlib.util.find_spec(package)
-        found = Path(spec.origin).resolve().parents[1] if spec and spec.origin else None
-        if found != home:
-            return (
-                f"the package {package!r} is found in {found}, not in {home}, where ventosa is: "
-                "another distribution has a package of that name; use a virtual environment "
-                "without it"
-            )
-    return None
 
 
 if __name__ == "__main__":

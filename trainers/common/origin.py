@@ -10,10 +10,8 @@ from dataclasses import dataclass
 from types import FrameType
 
 from trainers.common.errors import Failure, UserError
+from trainers.common.shadowing import PACKAGES
 from trainers.hookspecs import PROJECT_NAME
-
-PACKAGES = ("trainers", "envs", "encoders", "rewards", "curricula")
-"""Of ventosa."""
 
 
 @dataclass(frozen=True)
