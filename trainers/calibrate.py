@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Reads the command line."""
     parser = command_parser(
-        "python -m trainers.calibrate",
+        "calibrate",
         description="Learn how sure a trained policy is of its first actions, from episodes never "
         "used for training, and store that beside its weights.",
     )

@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Reads the command line."""
     parser = command_parser(
-        "python -m trainers.compare",
+        "compare",
         description="Run experiments with several seeds each, and put them side by side.",
     )
     parser.add_argument(

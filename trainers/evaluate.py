@@ -18,6 +18,7 @@ from trainers.common.options import (
     add_trust_option,
     command_parser,
     positive,
+    program,
     seed_number,
 )
 
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     from envs.evaluation import EvaluationOption
     from trainers.evaluation import Evaluation
     from trainers.runfile.settings import Component
-
-PROGRAM = "python -m trainers.evaluate"
 
 
 @tells_failures
@@ -76,7 +75,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
             environment = _environment(policy, known)
     offered = () if environment is None else environment.cls.evaluation_options
     parser = command_parser(
-        PROGRAM,
+        "evaluate",
         description="Report how good a policy is, in episodes never used for training.",
         parents=[generic],
         epilog=None if policy else "POLICY --help lists the options of its environment, too.",
@@ -102,7 +101,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 def _generic_options() -> argparse.ArgumentParser:
     """Options that every environment's policies can be evaluated with."""
     parser = argparse.ArgumentParser(
-        prog=PROGRAM, usage=f"{PROGRAM} POLICY [KEY=VALUE ...] [options]", add_help=False
+        prog=program("evaluate"),
+        usage="%(prog)s POLICY [KEY=VALUE ...] [options]",
+        add_help=False,
     )
     parser.add_argument("--episodes", type=positive, help="how many (default: the environment's)")
     parser.add_argument("--seed", type=seed_number, default=0, help="of the episodes")

@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Reads the command line."""
     parser = command_parser(
-        "python -m trainers.export",
+        "export",
         description="Write what it takes to use a policy into a folder of its own, or one file.",
     )
     parser.add_argument("policy", help="a run (its best checkpoint) or a checkpoint's folder")

@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Reads the command line; argparse itself exits with 2 on a mistake."""
-    parser = command_parser("python -m trainers.learn", description="Train as a run file says.")
+    parser = command_parser("learn", description="Train as a run file says.")
     parser.add_argument("config", type=Path, help="the run file")
     parser.add_argument(
         "overrides",

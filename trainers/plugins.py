@@ -13,7 +13,7 @@ from trainers.common.options import command_parser
 @tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Lists the components with their settings; returns the exit code."""
-    parser = command_parser("python -m trainers.plugins", description=main.__doc__)
+    parser = command_parser("plugins", description=main.__doc__)
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args(arguments)
     # Imported late, so that `--help` answers at once.

@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Reads the command line."""
     parser = command_parser(
-        "python -m trainers.predict",
+        "predict",
         description="Say what a policy does before images as a camera delivers them.",
     )
     parser.add_argument("policy", help="a run, a checkpoint's or an exported folder, or FILE.onnx")

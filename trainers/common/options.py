@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.metadata
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,20 @@ def version() -> str:
     return f"{PROJECT_NAME} {importlib.metadata.version(PROJECT_NAME)}"
 
 
-def command_parser(prog: str, **about: Any) -> argparse.ArgumentParser:
+def program(command: str) -> str:
+    """How a command is called, as this one was: by `ventosa`, or by `python -m`."""
+    by_console = Path(sys.argv[0]).stem == PROJECT_NAME
+    return f"{PROJECT_NAME} {command}" if by_console else f"python -m trainers.{command}"
+
+
+def command_parser(command: str, **about: Any) -> argparse.ArgumentParser:
     """A command's parser, with `--version`; its help tells defaults.
 
     Args:
-        prog: how the command is called.
+        command: its name.
         about: more of `argparse.ArgumentParser`'s.
     """
-    parser = argparse.ArgumentParser(prog=prog, formatter_class=_Help, **about)
+    parser = argparse.ArgumentParser(prog=program(command), formatter_class=_Help, **about)
     parser.add_argument(
         "--version", action="version", version=version(), help="show the version and exit"
     )

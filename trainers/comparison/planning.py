@@ -45,7 +45,7 @@ class PlannedRun:
             UserError: the run file is wrong, or what is there was made by another one.
         """
         asked = parse(dump_yaml(load_run(self.config, self.overrides, registries)), "").data
-        learn = ["-m", "trainers.learn", str(self.config), *self.overrides]
+        learn = ["-m", "trainers.console", "learn", str(self.config), *self.overrides]
         learn += ["--run-id", self.folder.name, "--results-dir", str(self.folder.parent)]
         done = False
         if (self.folder / CONFIGURATION).is_file():

@@ -10,6 +10,7 @@ from pathlib import Path
 from torch import nn
 
 from envs.environment import Environment
+from trainers.common.options import program
 
 MAX_STEPS = "trainer.max_steps"
 
@@ -61,8 +62,8 @@ def policy_commands(run: Path, *, trust: bool) -> dict[str, str]:
     """
     trusting = ["--trust"] if trust else []
     return {
-        "evaluate": _pasted("trainers.evaluate", run, *trusting),
-        "export": _pasted("trainers.export", run, Path("policies", run.name)),
+        "evaluate": _pasted("evaluate", run, *trusting),
+        "export": _pasted("export", run, Path("policies", run.name)),
     }
 
 
@@ -85,11 +86,11 @@ def resume_command(options: argparse.Namespace, max_steps: int | None = None) ->
         "--results-dir": None if options.results_dir == Path("results") else options.results_dir,
     }
     given = [word for flag, value in flags.items() if value is not None for word in (flag, value)]
-    return _pasted("trainers.learn", options.config, *overrides, *given, "--resume")
+    return _pasted("learn", options.config, *overrides, *given, "--resume")
 
 
-def _pasted(module: str, *words: object) -> str:
-    return f"python -m {module} {shlex.join(map(str, words))}"
+def _pasted(command: str, *words: object) -> str:
+    return f"{program(command)} {shlex.join(map(str, words))}"
 
 
 def _own_parameters(module: nn.Module) -> int:

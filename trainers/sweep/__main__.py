@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Reads the command line."""
     parser = command_parser(
-        "python -m trainers.sweep",
+        "sweep",
         description="Try settings of a run file, and report on which did best.",
     )
     parser.add_argument("sweep", type=Path, metavar="SWEEP", help="the sweep file")
