@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
@@ -18,12 +18,15 @@ from envs.evaluation import (
     error,
     rate,
 )
-from envs.grasp.evaluation.pick import PickCheck, Picker
 from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.evaluation.report import GraspReport
 from envs.grasp.evaluation.unanswerable import unanswerable
 from envs.grasp.robot.arm import Arm
 from envs.grasp.settings import GraspSettings
+from envs.grasp.simulators.installation import require_pybullet
+
+if TYPE_CHECKING:
+    from envs.grasp.evaluation.pick import PickCheck
 
 EVALUATION_OPTIONS: tuple[EvaluationOption, ...] = (
     RunFileOption("--simulator", "overrides `environment.simulator`", "environment.simulator"),
@@ -65,7 +68,15 @@ class GraspEvaluator(Evaluator):
         self._settings, self._arm, self._pose_commands = settings, arm, commands
 
     def physical_check(self, *, window: bool = False) -> PickCheck:
-        """The pick; see `envs.grasp.evaluation.pick`."""
+        """The pick; see `envs.grasp.evaluation.pick`.
+
+        Raises:
+            ValueError: PyBullet is not installed, or can't open a window.
+        """
+        require_pybullet("--window" if window else "--pick")
+        # Imported late, as it imports PyBullet.
+        from envs.grasp.evaluation.pick import PickCheck, Picker  # noqa: PLC0415
+
         settings = self._settings
         picker = Picker(self._arm, settings.support, settings.pick, window)
         return PickCheck(picker, self._pose_commands)

@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from enum import Enum, StrEnum, auto
+from enum import Enum, auto
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.grasp.evaluation.outcome import Outcome
 from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.robot.arm import Arm
 from envs.grasp.robot.kinematics import InverseKinematics, tooltip_pose
@@ -51,20 +52,6 @@ MOTOR_GAIN = 0.8
 SMOOTH_PEAK = 1.5
 # What a lift may lack: the block hangs a little lower than it stood, as it does on a real cup.
 LIFT_SLACK_M = 0.01
-
-
-class Outcome(StrEnum):
-    """Outcome of a pick."""
-
-    SUCCESS = "success"
-    COLLISION = "collision"
-    """On the way anything was touched, or while advancing anything but the target by the cup."""
-    MISSED = "missed"
-    """The cup came to no contact."""
-    NO_SEAL = "no_seal"
-    """In contact, some of the cup's rim was not on the target's face."""
-    DROPPED = "dropped"
-    """The block slipped off the cup, or did not come up."""
 
 
 class Touch(Enum):

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from encoders.spaces import NOTHING_SEEN
-from envs.grasp.evaluation.pick import Outcome
+from envs.grasp.evaluation.outcome import Outcome
 from envs.grasp.evaluation.pose_errors import PoseErrors, Sample, outcome_label
 from envs.grasp.scene.sampler import heading
 from envs.grasp.sensors.camera import CameraPoses, project

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.grasp.evaluation.pick import Outcome
+from envs.grasp.evaluation.outcome import Outcome
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.task import GoalRegion

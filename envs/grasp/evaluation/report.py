@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -14,6 +15,7 @@ from envs.grasp.evaluation.pose_errors import PoseErrors, Sample
 from envs.grasp.robot.arm import Arm
 from envs.grasp.sensors.clouds import cloud_camera
 from envs.grasp.settings import GraspSettings
+from envs.grasp.simulators.installation import has_pybullet
 from envs.grasp.task import GoalRegion, block_offset, yaw_error
 
 Floats = NDArray[np.float64]
@@ -21,6 +23,8 @@ Floats = NDArray[np.float64]
 SHOWN = 24
 FILMED = 4
 NEEDED = ("matplotlib", "PIL")
+
+_logger = logging.getLogger("ventosa")
 
 
 class GraspReport:
@@ -70,7 +74,6 @@ class GraspReport:
     def files(self) -> Iterator[tuple[str, bytes]]:
         """See `EvaluationReport`."""
         # Imported late: they need what an installation without pictures does not have.
-        from envs.grasp.evaluation.film import film  # noqa: PLC0415
         from envs.grasp.evaluation.plots import contact_sheet, error_histograms, workspace  # noqa: PLC0415
 
         errors, robot = _concatenate(self._errors), self._arm.robot
@@ -78,6 +81,11 @@ class GraspReport:
         yield episodes, contact_sheet(self._samples, robot.cup_radius_m)
         yield histograms, error_histograms(errors)
         yield places, workspace(errors)
+        if not has_pybullet():
+            _logger.warning("no %s: it is made in PyBullet, which is not installed", moving)
+            return
+        from envs.grasp.evaluation.film import film  # noqa: PLC0415
+
         yield moving, film(self._samples[:FILMED], self._settings, self._arm, self._picked)
 
     def _sample(self, commands: PoseCommands, errors: PoseErrors, row: slice) -> Sample:

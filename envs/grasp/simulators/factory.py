@@ -8,8 +8,7 @@ from envs.grasp.robot.urdf import Robot
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.base import Simulator
 from envs.grasp.simulators.fast import FastSimulator
-from envs.grasp.simulators.pybullet import PyBulletSimulator
-from envs.grasp.simulators.workers import ParallelSimulator
+from envs.grasp.simulators.installation import require_pybullet
 
 # Fewer worlds a process than this, and the messages cost more than the second core gives.
 MIN_WORLDS_PER_WORKER = 4
@@ -21,10 +20,19 @@ def make_simulator(
     """Builds the simulator of a run; a window means no worker processes.
 
     Raises:
-        ValueError: a window is asked for where there is none.
+        ValueError: a window is asked for where there is none, or PyBullet is not installed.
     """
     if settings.simulator == "fast":
         return _fast(settings, robot, num_worlds, window)
+    return _pybullet(settings, robot, num_worlds, window)
+
+
+def _pybullet(settings: GraspSettings, robot: Robot, num_worlds: int, window: bool) -> Simulator:
+    require_pybullet("simulator: pybullet")
+    # Imported late, as they import PyBullet.
+    from envs.grasp.simulators.pybullet import PyBulletSimulator  # noqa: PLC0415
+    from envs.grasp.simulators.workers import ParallelSimulator  # noqa: PLC0415
+
     workers = settings.workers
     if workers is None:
         workers = min(len(os.sched_getaffinity(0)), num_worlds // MIN_WORLDS_PER_WORKER)

@@ -413,7 +413,7 @@ def test_memory_does_not_grow_with_loads(
 def test_factory_obeys_the_number_of_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     monkeypatch.setattr(
-        "envs.grasp.simulators.factory.ParallelSimulator",
+        "envs.grasp.simulators.workers.ParallelSimulator",
         lambda worlds, workers, _robot, _support: asked.append((worlds, workers)),
     )
     monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: set(range(4)))
