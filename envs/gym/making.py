@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -11,7 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from envs.environment import EnvironmentFailure
 from envs.gym.episodes import RepeatableEpisodes, StackedEpisodes
-from envs.gym.processes import ProcessVectorEnv
+from envs.gym.processes import Message, ProcessVectorEnv, RestartLimits
 from envs.gym.settings import GymSettings
 from envs.gym.spaces import WRAP, flattens
 
@@ -20,13 +21,20 @@ EXTRAS = {"gymnasium.envs.mujoco": "mujoco", "gymnasium.envs.box2d": "box2d"}
 """Packages of environments -> our optional dependencies that they need."""
 
 
-def make_vector_env(settings: GymSettings, seed: int, *, with_infos: bool) -> GymVectorEnv:
+def make_vector_env(
+    settings: GymSettings,
+    seed: int,
+    *,
+    with_infos: bool,
+    prepare: Callable[[], Sequence[Message]],
+) -> GymVectorEnv:
     """Makes N environments that are stepped together and reset in the step an episode ends in.
 
     Args:
         settings: which, and how many.
         seed: of all their episodes.
         with_infos: see `RepeatableEpisodes`.
+        prepare: see `ProcessVectorEnv`.
 
     Raises:
         ValueError: it does not exist, lacks a package, refuses its arguments, or can't be stepped
@@ -38,7 +46,12 @@ def make_vector_env(settings: GymSettings, seed: int, *, with_infos: bool) -> Gy
     ]
     try:
         if settings.vectorization == "async":
-            return ProcessVectorEnv(makers, settings.id, settings.timeout_s)
+            limits = RestartLimits(
+                settings.max_lifetime_restarts,
+                settings.restarts_rate_limit_n,
+                settings.restarts_rate_limit_period_s,
+            )
+            return ProcessVectorEnv(makers, settings.id, settings.timeout_s, limits, prepare)
         # Whoever reads the observations copies them anyway.
         return SyncVectorEnv(makers, copy=False, autoreset_mode=AutoresetMode.SAME_STEP)
     except (ValueError, EnvironmentFailure):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
@@ -11,6 +11,16 @@ MOST_PROCESSES = 1024
 
 class GymSettings(BaseModel, frozen=True, extra="forbid"):
     """Any environment that is registered with gymnasium."""
+
+    # What a run may go on with other values of.
+    changeable_keys: ClassVar[frozenset[str]] = frozenset(
+        {
+            "timeout_s",
+            "max_lifetime_restarts",
+            "restarts_rate_limit_n",
+            "restarts_rate_limit_period_s",
+        }
+    )
 
     id: str = Field(
         min_length=1,
@@ -25,7 +35,22 @@ class GymSettings(BaseModel, frozen=True, extra="forbid"):
         gt=0.0,
         le=86_400.0,
         description="Seconds that a step or a reset of an environment in a process of its own may "
-        "take; one that does not answer ends the run with an error.",
+        "take; one that does not answer hangs.",
+    )
+    max_lifetime_restarts: int = Field(
+        10,
+        ge=-1,
+        description="Times that the process of an environment is started again, each for itself, "
+        "where it died or hangs, before the run ends with an error; -1: no limit.",
+    )
+    restarts_rate_limit_n: int = Field(
+        1,
+        ge=-1,
+        description="The same within restarts_rate_limit_period_s: what dies at once again and "
+        "again ends the run; -1: no limit.",
+    )
+    restarts_rate_limit_period_s: float = Field(
+        60.0, gt=0.0, le=86_400.0, description="Seconds of restarts_rate_limit_n."
     )
     max_episode_steps: int | None = Field(
         None, ge=1, description="Steps before an episode is truncated; null: the environment's own."

@@ -18,6 +18,7 @@ from envs.gym.action_history import ActionHistory
 from envs.gym.episodes import IS_SUCCESS
 from envs.gym.making import make_vector_env
 from envs.gym.parameters import gather
+from envs.gym.processes import Message
 from envs.gym.settings import GymSettings
 from envs.gym.spaces import ActionAdapter, ObservationAdapter
 from rewards.gym.transition import GymTransition
@@ -60,7 +61,9 @@ class GymEnvironment(Environment):
         self._rewards = fitting(rewards, self.snapshot)
         self.name, self._seed = settings.id, seed
         self.num_envs = settings.num_envs
-        self._vector = make_vector_env(settings, seed, with_infos=bool(rewards))
+        self._vector = make_vector_env(
+            settings, seed, with_infos=bool(rewards), prepare=self._next_episodes
+        )
         try:
             self._observe = ObservationAdapter(
                 self._vector.single_observation_space, settings.channels, settings.frame_stack
@@ -103,10 +106,10 @@ class GymEnvironment(Environment):
             self._seed = int(seed)
             self._begun[:] = 0
             self._call("count_from", self._seed, self._begun)
+        observations, _ = self._guarded(self._vector.reset)
         self._begun += 1
         self._lengths[:] = 0
         self._history.keep(0)
-        observations, _ = self._guarded(self._vector.reset)
         self._observations = self._observe(observations)
         return self._observations, {}
 
@@ -126,7 +129,7 @@ class GymEnvironment(Environment):
         if len(self._history.actions) > LONGEST_REPLAY_STEPS:
             self._history.keep(self._longest_replay())
         self._observations = self._observe(observations)
-        infos = self._end_episodes(terminated | truncated, gathered)
+        infos = self._end_episodes(terminated | truncated, before, gathered)
         if self._rewards:
             transition = GymTransition(
                 observations=before,
@@ -215,14 +218,20 @@ class GymEnvironment(Environment):
                 "the environment %r did not close: %s: %s", self.name, type(error).__name__, error
             )
 
-    def _end_episodes(self, done: NDArray[np.bool_], gathered: Mapping[str, Any]) -> dict[str, Any]:
+    def _next_episodes(self) -> list[Message]:
+        """What an environment that was started again is asked, to go on with its next episode."""
+        return [("count_from", (self._seed, self._begun))]
+
+    def _end_episodes(
+        self, done: NDArray[np.bool_], before: ObservationArrays, gathered: Mapping[str, Any]
+    ) -> dict[str, Any]:
         """Counts the episodes that ended, (N,); infos that tell of them, empty where none did."""
         if not done.any():
             return {}
         self._begun[done] += 1
         self._lengths[done] = 0
         self._history.keep(self._longest_replay())
-        final = self._final(gathered["final_obs"], done)
+        final = self._final(before, gathered)
         return {"final_obs": final, "_final_obs": done, **self._success(gathered, done)}
 
     def _longest_replay(self) -> int:
@@ -257,15 +266,17 @@ class GymEnvironment(Environment):
         success[told] = [bool(value) for value in gathered.get(IS_SUCCESS, success)[told]]
         return {"episode_metrics": {SUCCESS.metric: success}}
 
-    def _final(self, last: NDArray[Any], done: NDArray[np.bool_]) -> ObservationArrays:
-        """Observations (N, ...), right where episodes ended, from an array (N,) of objects."""
-        ended = self._observe(self._stacked(list(last[done])))
-        final = {
-            name: np.zeros((self.num_envs, *values.shape[1:]), values.dtype)
-            for name, values in ended.items()
-        }
-        for name, values in ended.items():
-            final[name][done] = values
+    def _final(self, before: ObservationArrays, gathered: Mapping[str, Any]) -> ObservationArrays:
+        """Last observations (N, ...), right where episodes ended.
+
+        Those of an episode whose process was lost are the ones before its last step.
+        """
+        final = {name: values.copy() for name, values in before.items()}
+        told = gathered.get("_final_obs")
+        if told is not None:
+            ended = self._observe(self._stacked(list(gathered["final_obs"][told])))
+            for name, values in ended.items():
+                final[name][told] = values
         return final
 
     def _stacked(self, observations: Sequence[Any]) -> Any:

@@ -215,6 +215,7 @@ def environment(fault: str, step: int, vectorization: str) -> dict[str, Any]:
         "num_envs": NUM_ENVS,
         "vectorization": vectorization,
         "timeout_s": 3.0 if fault == "hangs" else 60.0,
+        "max_lifetime_restarts": 0,
         "kwargs": {"fault": fault, "step": step},
     }
 
@@ -250,6 +251,38 @@ def test_a_fault_is_named_and_the_run_is_saved(
     assert done.code == 1
     assert "Traceback" not in done.errors + done.output
     assert_saved(done.results, step, "failed", f"environment {FAULTY} of")
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning:gymnasium.utils")
+@pytest.mark.parametrize(
+    ("fault", "step"),
+    [
+        ("leaves", RESET),
+        ("killed", LATER),
+        *(
+            pytest.param(fault, step, marks=pytest.mark.soak)
+            for fault, step in [("leaves", LATER), ("killed", FIRST), ("hangs", LATER)]
+        ),
+    ],
+)
+def test_a_run_goes_on_with_a_process_that_was_started_again(
+    learn: Learn, write_run: WriteRun, caplog: pytest.LogCaptureFixture, fault: str, step: int
+) -> None:
+    allowed = environment(fault, step, "async") | {"max_lifetime_restarts": 10}
+    trainer = {"max_steps": 200, "hyperparameters": {"buffer_size": BUFFER_STEPS}}
+    done = learn(write_run(allowed, trainer))
+    if step == RESET:  # of the same episode, in which it dies again
+        assert done.code == 1
+        assert "it had been started again 1 times, and may not be once more" in done.errors
+        return
+    assert done.code == 0, done.errors
+    assert done.step == 208
+    [told] = caplog.messages
+    assert re.search(FAULTS[fault][1], told)
+    assert told.startswith(f"environment {FAULTY} of '{ENV_ID}'")
+    assert told.endswith(": it is started again, and its episode is cut off")
+    assert json.loads((done.results / "toy/status.json").read_text())["state"] == "finished"
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.parametrize("vectorization", ["sync", "async"])

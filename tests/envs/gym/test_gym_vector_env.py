@@ -18,6 +18,7 @@ from gymnasium.spaces import Box, Dict, Discrete, Sequence, Text
 from envs.environment import EnvironmentFailure
 from envs.gym import vector_env
 from envs.gym.episodes import episode_seed
+from envs.gym.processes import ProcessVectorEnv
 from envs.gym.settings import GymSettings
 from envs.gym.vector_env import GymEnvironment
 from rewards.gym.environment import EnvironmentReward
@@ -226,6 +227,58 @@ def test_going_back_brings_back_the_observations_before_the_last() -> None:
             seen = env.step(actions)[0]
         assert_same(other.load_state_dict(env.state_dict()), seen)
         assert_same(other.step(after), env.step(after))
+
+
+def lose(env: GymEnvironment, index: int) -> None:
+    assert isinstance(env._vector, ProcessVectorEnv)
+    process = env._vector.processes[index]
+    process.kill()
+    process.join()
+
+
+def test_an_episode_whose_process_was_lost_is_cut_off_where_it_was_seen_last() -> None:
+    with closing(make(count=2, vectorization="async")) as env, closing(make(count=2)) as other:
+        actions = actions_for(env, 60)
+        last, _ = env.reset()
+        while env._lengths[1] != 1:
+            last = env.step(actions[0])[0]
+        begun = int(env._begun[1])
+        lose(env, 1)
+        observations, reward, terminated, truncated, infos = env.step(actions[0])
+        assert (reward[1], terminated[1], truncated[1]) == (0.0, False, True)
+        assert infos["_final_obs"][1]
+        for name, values in infos["final_obs"].items():
+            np.testing.assert_array_equal(values[1], last[name][1])
+        # The next one is the one that would have come next, here and wherever the run goes on.
+        room, _ = Room().reset(seed=episode_seed(7, 1, begun))
+        np.testing.assert_array_equal(observations["view"][1], room["view"])
+        other.load_state_dict(env.state_dict())
+        for now in actions:
+            assert_same(env.step(now), other.step(now))
+
+
+def test_a_first_episode_whose_process_was_lost_begins_again() -> None:
+    with closing(make(count=2, vectorization="async")) as env, closing(make(count=2)) as other:
+        lose(env, 0)
+        assert_same(env.reset()[0], other.reset()[0])
+        assert_same(env.state_dict(), other.state_dict())
+
+
+def test_an_episode_whose_process_was_lost_is_no_success() -> None:
+    gymnasium.register("ventosa_tests/Telling-v0", entry_point=Telling)
+    try:
+        env = make("ventosa_tests/Telling-v0", 2, vectorization="async")
+        with closing(env):
+            env.reset()
+            steps = np.zeros(2, int)
+            while "episode_metrics" not in env.step(steps)[4]:
+                pass
+            lose(env, 0)
+            infos = env.step(steps)[4]
+            assert infos["_final_obs"].tolist()[0]
+            assert not infos["episode_metrics"]["success"][0]
+    finally:
+        del gymnasium.registry["ventosa_tests/Telling-v0"]
 
 
 def assert_same(one: Any, other: Any) -> None:
@@ -695,7 +748,8 @@ def test_an_action_that_a_reward_writes_to_is_played_again_as_it_was(reusing: st
 def test_an_environment_that_breaks_down_is_named_and_can_be_closed(
     vectorization: str, trouble: str, message: str
 ) -> None:
-    env = make(vectorization=vectorization, kwargs={"trouble": trouble})
+    strict = {"vectorization": vectorization, "max_lifetime_restarts": 0}
+    env = make(**strict, kwargs={"trouble": trouble})
     env.reset()
     actions = actions_for(env, 2)
     env.step(actions[0])

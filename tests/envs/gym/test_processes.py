@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -17,7 +18,7 @@ from gymnasium.spaces import Box, Discrete
 
 from envs.environment import EnvironmentFailure
 from envs.gym import processes
-from envs.gym.processes import ProcessVectorEnv
+from envs.gym.processes import Message, ProcessLost, ProcessVectorEnv, RestartLimits
 
 
 class Clock(gymnasium.Env[Any, Any]):
@@ -31,12 +32,13 @@ class Clock(gymnasium.Env[Any, Any]):
     action_space = Discrete(2)
 
     def __init__(self, size: int = 1, info: Any = None):
+        self.begins_at = 0
         self.observation_space = Box(0.0, 9.0, (size,), np.float32)
         self.info = {} if info is None else {"info": info}
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        self.steps = 0
-        return np.zeros(self.observation_space.shape, np.float32), {}
+        self.steps = self.begins_at
+        return np.full(self.observation_space.shape, self.steps, np.float32), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.steps += 1
@@ -46,12 +48,15 @@ class Clock(gymnasium.Env[Any, Any]):
     def play(self, *arguments: Any) -> str:
         return "played"
 
+    def begin_at(self, steps: int) -> None:
+        self.begins_at = steps
+
 
 ACTIONS = np.array([0, 1])
 
 
-def make(*makers: Callable[[], Any], timeout_s: float = 60.0) -> ProcessVectorEnv:
-    return ProcessVectorEnv(makers or (Clock, Clock), "Clock", timeout_s)
+def make(*makers: Callable[[], Any], timeout_s: float = 60.0, **options: Any) -> ProcessVectorEnv:
+    return ProcessVectorEnv(makers or (Clock, Clock), "Clock", timeout_s, **options)
 
 
 def ended(pids: list[int], within_s: float) -> bool:
@@ -108,6 +113,102 @@ def test_one_that_does_not_answer_is_named_and_killed(monkeypatch: pytest.Monkey
         env.call("play", np.zeros((5, 2)))
     env.close()
     assert ended(pids, 1.0)
+
+
+def lose(env: ProcessVectorEnv, index: int) -> None:
+    process = env.processes[index]
+    process.kill()
+    process.join()
+
+
+def test_one_that_died_is_started_again_and_its_episode_cut_off(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    asked: list[Message] = [("begin_at", (1,))]
+    with closing(make(limits=RestartLimits(lifetime=1), prepare=lambda: asked)) as env:
+        env.reset()
+        env.step(ACTIONS)
+        lost = env.processes[1].pid
+        lose(env, 1)
+        observations, reward, terminated, truncated, infos = env.step(ACTIONS + 5)
+        assert observations.tolist() == [[2.0], [1.0]]  # and the next one begins as it was told to
+        assert reward.tolist() == [5.0, 0.0]
+        assert terminated.tolist() == [False, False]
+        assert truncated.tolist() == [False, True]
+        assert infos == {}
+        assert env.processes[1].pid != lost
+        assert caplog.messages == [
+            f"environment 1 of 'Clock': its process {lost} was killed by SIGKILL when it was asked "
+            "to step: it is started again, and its episode is cut off"
+        ]
+        observations, _, _, truncated, infos = env.step(ACTIONS)
+        assert observations.tolist() == [[0.0], [2.0]]
+        assert truncated.tolist() == [True, False]
+        assert infos["final_obs"][0].tolist() == [3.0]
+
+        lose(env, 1)
+        told = "had been started again 1 times, and may not be once more: see environment.max_life"
+        with pytest.raises(ProcessLost, match=told):
+            env.step(ACTIONS)
+
+
+def test_one_that_hangs_is_killed_and_started_again() -> None:
+    with closing(make(timeout_s=2.0, limits=RestartLimits(lifetime=1))) as env:
+        env.reset()
+        pid = env.processes[0].pid
+        assert pid is not None
+        os.kill(pid, signal.SIGSTOP)
+        observations, *_, truncated, _ = env.step(ACTIONS)
+        assert truncated.tolist() == [True, False]
+        assert observations.tolist() == [[0.0], [1.0]]
+        assert ended([pid], 1.0)
+
+
+def test_one_that_dies_in_a_reset_begins_again() -> None:
+    with closing(make(limits=RestartLimits(lifetime=-1))) as env:
+        lose(env, 0)
+        assert env.reset()[0].tolist() == [[0.0], [0.0]]
+        lose(env, 0)
+        # What has to be known of every environment, nobody else can answer.
+        with pytest.raises(ProcessLost, match="asked to play"):
+            env.call("play", ACTIONS)
+
+
+def test_one_that_is_lost_again_while_it_begins_has_another_try(tmp_path: Path) -> None:
+    """Its maker kills the process the second time that it makes an environment."""
+
+    def maker() -> Clock:
+        made = len(list(tmp_path.iterdir()))
+        (tmp_path / str(made)).touch()
+        if made == 2:  # the first was to see the spaces
+            os._exit(7)
+        return Clock()
+
+    with closing(make(maker, limits=RestartLimits(lifetime=2))) as env:
+        env.reset()
+        lose(env, 0)
+        assert env.step(ACTIONS[:1])[3].tolist() == [True]
+        assert len(list(tmp_path.iterdir())) == 4
+
+
+@pytest.mark.parametrize(
+    ("limits", "restarts", "allowed"),
+    [
+        (RestartLimits(lifetime=0), [], False),
+        (RestartLimits(lifetime=2), [1.0], True),
+        (RestartLimits(lifetime=2), [1.0, 2.0], False),
+        (RestartLimits(lifetime=-1), [1.0] * 99, True),
+        (RestartLimits(lifetime=9, in_period=1, period_s=60.0), [40.0], False),
+        (RestartLimits(lifetime=9, in_period=1, period_s=60.0), [39.0], True),
+        (RestartLimits(lifetime=9, in_period=2, period_s=60.0), [39.0, 40.0], True),
+        (RestartLimits(lifetime=9, in_period=0, period_s=60.0), [], False),
+        (RestartLimits(lifetime=2, in_period=-1), [99.0, 99.0], False),
+    ],
+)
+def test_restarts_are_limited_in_all_and_within_a_time(
+    limits: RestartLimits, restarts: list[float], allowed: bool
+) -> None:
+    assert limits.allow(restarts, now=100.0) is allowed
 
 
 def test_what_a_process_can_not_hand_over_is_a_failure() -> None:
