@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
+from trainers.common import process
 from trainers.common.command import DONE, tells_failures
 from trainers.common.options import (
     add_results_option,
@@ -26,6 +27,7 @@ EPISODES = 80_000
 def main(arguments: Sequence[str] | None = None) -> int:
     """Calibrates a policy; returns the exit code."""
     options = parse(arguments)
+    process.prepare()
     # Imported late, so that `--help` answers at once.
     from trainers.deployment.calibration import calibrate  # noqa: PLC0415
 

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from trainers.common import process
 from trainers.common.command import DONE, tells_failures
 from trainers.common.errors import UserError, suggestion
 from trainers.common.files import write_atomically
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 @tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluates a policy; returns the exit code."""
+    process.prepare()  # for it may take torch to read a command line
     options = parse(sys.argv[1:] if arguments is None else arguments)
     # Imported late, as below, so that `--help` answers at once.
     from rich.console import Console  # noqa: PLC0415

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-import os
 import platform
 import re
 import subprocess
@@ -19,6 +18,7 @@ from benchmarks.command import ROOT
 from benchmarks.speed.figures import FRAME_GRAB, RIVALS, Figures, speedup
 from benchmarks.speed.simulation import frames, steps
 from benchmarks.speed.training import contenders, training
+from trainers.common.cores import usable_cores
 from trainers.common.errors import UserError
 from trainers.common.files import write_atomically
 from trainers.runfile.validation import InvalidError, validate
@@ -163,7 +163,7 @@ def this_machine() -> Machine:
     text = CPUINFO.read_text() if CPUINFO.exists() else ""
     model = re.search(r"^model name\s*: (.*)$", text, re.MULTILINE)
     return Machine(
-        cores=len(os.sched_getaffinity(0)),
+        cores=usable_cores(),
         processor=model[1] if model else platform.processor(),
         python=platform.python_version(),
         packages={name: importlib.metadata.version(name) for name in PACKAGES},

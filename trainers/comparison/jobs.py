@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
-CORES = len(os.sched_getaffinity(0))
+from trainers.common.cores import usable_cores
+
+CORES = usable_cores()
 POLL_S = 1.0
 SIGNALLED = 128
 """Exit code of a command that a signal ended, less the signal's number, as shells have it."""

@@ -1,4 +1,4 @@
-"""What becomes of a pick."""
+"""How a pick ends."""
 
 from __future__ import annotations
 

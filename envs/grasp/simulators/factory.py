@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
-
 from envs.grasp.robot.urdf import Robot
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.base import Simulator
 from envs.grasp.simulators.fast import FastSimulator
 from envs.grasp.simulators.installation import require_pybullet
+from trainers.common.cores import usable_cores
 
 # Fewer worlds a process than this, and the messages cost more than the second core gives.
 MIN_WORLDS_PER_WORKER = 4
@@ -35,7 +34,7 @@ def _pybullet(settings: GraspSettings, robot: Robot, num_worlds: int, window: bo
 
     workers = settings.workers
     if workers is None:
-        workers = min(len(os.sched_getaffinity(0)), num_worlds // MIN_WORLDS_PER_WORKER)
+        workers = min(usable_cores(), num_worlds // MIN_WORLDS_PER_WORKER)
         workers = workers if workers > 1 else 0
     if window or workers == 0:
         return PyBulletSimulator(num_worlds, robot, settings.support, window)

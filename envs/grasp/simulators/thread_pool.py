@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+
+from trainers.common.cores import usable_cores
 
 # A part costs the call of a compiled function, some 15 us.
 PARTS_PER_THREAD = 2
@@ -18,7 +19,7 @@ class ThreadPool:
     barriers of OpenMP, on machines where others compute as well.
 
     Args:
-        threads: how many, with the caller; None: one for each core.
+        threads: how many, with the caller; None: one for each core that may be used.
 
     Raises:
         ValueError: `threads` is less than one.
@@ -27,7 +28,7 @@ class ThreadPool:
     def __init__(self, threads: int | None = None):
         if threads is not None and threads < 1:
             raise ValueError(f"{threads} threads: there must be at least 1")
-        self._threads = threads = threads or len(os.sched_getaffinity(0))
+        self._threads = threads = threads or usable_cores()
         self._helpers = ThreadPoolExecutor(threads - 1) if threads > 1 else None
 
     def parallel_for(self, work: Callable[[int, int], None], rows: int) -> None:

@@ -416,7 +416,7 @@ def test_factory_obeys_the_number_of_workers(monkeypatch: pytest.MonkeyPatch) ->
         "envs.grasp.simulators.workers.ParallelSimulator",
         lambda worlds, workers, _robot, _support: asked.append((worlds, workers)),
     )
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: set(range(4)))
+    monkeypatch.setattr("envs.grasp.simulators.factory.usable_cores", lambda: 4)
     for workers, worlds in ((None, 64), (None, 8), (3, 64), (5, 2)):
         make_simulator(GraspSettings(workers=workers), ROBOT, worlds)
     # One a core, but none with fewer than four worlds; never more workers than worlds.
