@@ -61,6 +61,8 @@ class GymEnvironment(Environment):
         self._rewards = fitting(rewards, self.snapshot)
         self.name, self._seed = settings.id, seed
         self.num_envs = settings.num_envs
+        self._begun = np.zeros(self.num_envs, np.int64)
+        self._parameters: dict[str, ParameterValue] = {}
         self._vector = make_vector_env(
             settings, seed, with_infos=bool(rewards), prepare=self._next_episodes
         )
@@ -76,7 +78,6 @@ class GymEnvironment(Environment):
         self.single_action_space = self._act.space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._begun = np.zeros(self.num_envs, np.int64)
         self._lengths = np.zeros(self.num_envs, np.int64)
         # As many steps as the longest episode has that can be played again, at least.
         self._history = ActionHistory(self.action_space.shape or (), self.action_space.dtype)
@@ -147,7 +148,8 @@ class GymEnvironment(Environment):
     def set_parameters(self, parameters: Mapping[str, ParameterValue]) -> None:
         """See `Environment.set_parameters`."""
         super().set_parameters(parameters)
-        self._call("set_parameters", dict(parameters))
+        self._parameters = dict(parameters)
+        self._call("set_parameters", self._parameters)
         self._has_parameters |= bool(parameters)
 
     def state_dict(self) -> dict[str, Any]:
@@ -220,7 +222,10 @@ class GymEnvironment(Environment):
 
     def _next_episodes(self) -> list[Message]:
         """What an environment that was started again is asked, to go on with its next episode."""
-        return [("count_from", (self._seed, self._begun))]
+        return [
+            ("count_from", (self._seed, self._begun)),
+            ("set_parameters", (self._parameters,)),
+        ]
 
     def _end_episodes(
         self, done: NDArray[np.bool_], before: ObservationArrays, gathered: Mapping[str, Any]

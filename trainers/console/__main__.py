@@ -20,6 +20,7 @@ COMMANDS = {
     "calibrate": ("trainers.calibrate", "learn how sure a policy may be of its answers"),
     "compare": ("trainers.compare", "train run files with several seeds, side by side"),
     "sweep": ("trainers.sweep.__main__", "try settings of a run file"),
+    "convert": ("trainers.convert.__main__", "make a run file of ML-Agents' configuration"),
     "plugins": ("trainers.plugins", "list all components and their settings"),
 }
 """By name: the module, whose `main` takes the rest of the line, and what it does."""

@@ -19,6 +19,7 @@ from curricula.samplers import UniformParameters, UniformSampler
 from envs.environment import EnvironmentFailure
 from envs.gym import vector_env
 from envs.gym.parameters import AttributeParameters
+from envs.gym.processes import ProcessVectorEnv
 from envs.gym.settings import GymSettings
 from envs.gym.vector_env import GymEnvironment
 from trainers.common.errors import UserError
@@ -115,6 +116,18 @@ def test_the_parameters_are_numbers_of_its_own_or_what_it_declares() -> None:
         assert env.parameter_names == {"mass", "count", "limit"}
         with pytest.raises(ValueError, match=r"\['height'\]; there are: \['count', 'limit', 'ma"):
             env.set_parameters({"height": 1.0})
+
+
+def test_a_process_that_was_lost_has_them_when_it_is_started_again() -> None:
+    with closing(make(vectorization="async")) as env:
+        env.reset()
+        env.set_parameters({"mass": 9.0})
+        assert isinstance(env._vector, ProcessVectorEnv)
+        process = env._vector.processes[2]
+        process.kill()
+        process.join()
+        play(env, 1)
+        assert shown(play(env, STEPS)[-1][0], "mass").tolist() == [9.0] * 4
 
 
 def test_whole_numbers_stay_whole_where_the_attribute_is() -> None:
