@@ -56,6 +56,7 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
             run file says so. They may be of the class or of the instance.
         evaluation_episodes: how many an evaluation plays unless it is told otherwise.
         evaluation_options: what `trainers.evaluate` offers for it, next to its own options.
+        tags: what each of its episode metrics says, by TensorBoard tag, for the reference.
     """
 
     name: str = ""
@@ -66,6 +67,7 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
     privileged: frozenset[str] = frozenset()
     evaluation_episodes: ClassVar[int] = 100
     evaluation_options: ClassVar[tuple[EvaluationOption, ...]] = ()
+    tags: ClassVar[Mapping[str, str]] = {}
     single_observation_space: gymnasium.spaces.Dict
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 

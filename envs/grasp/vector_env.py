@@ -72,6 +72,15 @@ class GraspVectorEnv(Environment):
     parameter_names = frozenset({*GOAL_PARAMETERS, *SENSOR_PARAMETERS, YAW_LIMIT})
     evaluation_episodes: ClassVar[int] = 1000
     evaluation_options: ClassVar[tuple[EvaluationOption, ...]] = EVALUATION_OPTIONS
+    tags: ClassVar[Mapping[str, str]] = {
+        "Environment/Collision Rate": "Share of the finished episodes with a collision.",
+        "Environment/Position Error M": "Distance of the tooltip, after an episode's last action, "
+        "from the middle of the goal region, in metres.",
+        "Environment/Position Error X M": "The same along the face's lateral axis.",
+        "Environment/Position Error Y M": "The same upwards.",
+        "Environment/Position Error Z M": "The same along the face's normal: the gap's.",
+        "Environment/Yaw Error Deg": "Angle between cup and face about the vertical, in degrees.",
+    }
     metadata: dict[str, Any] = {  # noqa: RUF012
         "autoreset_mode": AutoresetMode.SAME_STEP,
         "render_modes": ["human", "rgb_array"],

@@ -22,11 +22,13 @@ class Algorithm(Protocol):
 
     Attributes:
         Settings: its model, of `TrainerSettings`.
+        tags: what each statistic of `update` says, by its tag, for the reference.
         policy: what acts, and what is saved as the weights.
         collection_steps: steps that `collect` takes, over all environments.
     """
 
     Settings: ClassVar[type[TrainerSettings]]
+    tags: ClassVar[Mapping[str, str]]
     policy: PolicyNetwork
     collection_steps: int
 

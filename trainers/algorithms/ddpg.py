@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -53,6 +54,13 @@ class DDPG(OffPolicyAlgorithm):
     """DDPG from a replay buffer. See `trainers.algorithms.base.Algorithm`."""
 
     Settings = DDPGSettings
+    tags: ClassVar[Mapping[str, str]] = {
+        "Losses/Policy Loss": "Mean value of the policy's own actions, negated.",
+        "Losses/Value Loss": "Mean squared error of the critic's values.",
+        "Policy/Q Value": "Mean value of the actions in the buffer.",
+        "Policy/Noise": "Deviation of the exploration noise, of actions in [-1, 1].",
+        **OffPolicyAlgorithm.tags,
+    }
     policy: DeterministicPolicy
     _hyperparameters: DDPGHyperparameters
 

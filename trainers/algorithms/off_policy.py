@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -144,6 +144,10 @@ class OffPolicyAlgorithm(ABC):
         _augment: to be called on all observations that are learned from.
     """
 
+    tags: ClassVar[Mapping[str, str]] = {
+        "Policy/Learning Rate": "Of the policy, as scheduled.",
+        "Policy/Critic Learning Rate": "Of the critic, as scheduled.",
+    }
     policy: OffPolicyNetwork
     state_size = 0
     _hyperparameters: OffPolicyHyperparameters

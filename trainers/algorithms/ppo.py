@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from pydantic import Field
@@ -91,6 +91,21 @@ class PPO(OnPolicyAlgorithm):
     """PPO with a clipped objective. See `trainers.algorithms.base.Algorithm`."""
 
     Settings = PPOSettings
+    tags: ClassVar[Mapping[str, str]] = {
+        "Losses/Policy Loss": "Clipped objective, negated; without entropy bonus and KL penalty.",
+        "Losses/Value Loss": "Mean squared error of the critic's values, before its coefficient.",
+        "Policy/Entropy": "Mean entropy of the distribution of actions, in nats.",
+        "Policy/KL": "Mean KL(old || new) in nats, by the ratio of probabilities: how far the "
+        "policy has moved within an update.",
+        "Policy/Clip Fraction": "Share of the actions whose ratio of probabilities is beyond "
+        "epsilon.",
+        "Policy/Explained Variance": "Share of the returns' variance that the values before the "
+        "update explain: 1 is all, under 0 is worse than their mean.",
+        "Policy/Learning Rate": "Of the policy, as scheduled.",
+        "Policy/Critic Learning Rate": "Of the critic, as scheduled.",
+        "Policy/Epsilon": "How far the ratio of probabilities may move, as scheduled.",
+        "Policy/Beta": "Weight of the entropy bonus, as scheduled.",
+    }
 
     def __init__(
         self,

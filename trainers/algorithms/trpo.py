@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from pydantic import Field, field_validator
@@ -99,6 +99,19 @@ class TRPO(OnPolicyAlgorithm):
     """TRPO with a critic fitted by gradient descent. See `trainers.algorithms.base.Algorithm`."""
 
     Settings = TRPOSettings
+    tags: ClassVar[Mapping[str, str]] = {
+        "Losses/Policy Loss": "Surrogate gain of the step that was taken, negated; 0 for none.",
+        "Losses/Value Loss": "Mean squared error of the critic's values as they are fitted.",
+        "Policy/Entropy": "Mean entropy of the distribution of actions before the step, in nats.",
+        "Policy/KL": "Mean KL(old || new) of the step that was taken, in nats; 0 for none.",
+        "Policy/Line Search Steps": "Trials of the line search.",
+        "Policy/Step Accepted": "1 where one of them was accepted; on average the share of updates "
+        "that moved the policy.",
+        "Policy/Explained Variance": "Share of the returns' variance that the values before the "
+        "update explain: 1 is all, under 0 is worse than their mean.",
+        "Policy/Learning Rate": "Of the critic, as scheduled.",
+        "Policy/Delta": "Largest KL of a step, as scheduled.",
+    }
 
     def __init__(
         self,

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import torch
 from pydantic import Field
 from torch import Tensor
@@ -48,6 +51,13 @@ class SAC(OffPolicyAlgorithm):
     """SAC from a replay buffer. See `trainers.algorithms.base.Algorithm`."""
 
     Settings = SACSettings
+    tags: ClassVar[Mapping[str, str]] = {
+        "Losses/Policy Loss": "Mean of alpha log pi(a|s) - Q(s, a), of the policy's own actions.",
+        "Losses/Value Loss": "Mean squared error of both critics' values, summed.",
+        "Policy/Entropy": "Mean entropy of the distribution of actions, in nats.",
+        "Policy/Entropy Coefficient": "Temperature alpha, the weight of the entropy.",
+        **OffPolicyAlgorithm.tags,
+    }
     policy: SACPolicy
     _hyperparameters: SACHyperparameters
 
