@@ -30,7 +30,7 @@ from curricula.samplers import ParameterValue
 
 
 class Lessons:
-    """A row of lessons; see the module for how they are written.
+    """A row of lessons, each over once a measure has passed its threshold.
 
     The measures `reward` and `success` are smoothed: the mean over the latest episodes of the
     lesson must stay over its threshold for a number of consecutive episodes. Each lesson starts

@@ -5,6 +5,7 @@ The helpers are handed out by fixtures, because a `conftest` can't be imported r
 
 from __future__ import annotations
 
+import importlib.metadata
 import sys
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -458,6 +459,14 @@ def install_plugin(
 def registries() -> Registries:
     """What is built in, and the toys."""
     return load_registries(plugin_manager((*BUILT_IN_PLUGINS, ToyPlugin())))
+
+
+@pytest.fixture(scope="session")
+def built_in() -> Registries:
+    """What is built in alone, whatever else is installed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importlib.metadata, "entry_points", lambda **_: ())
+        return load_registries()
 
 
 @pytest.fixture(scope="session")

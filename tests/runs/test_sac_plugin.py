@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal, TanhTransform, TransformedDistribution
 
@@ -282,6 +283,14 @@ def test_a_run_taken_up_again_ends_exactly_as_one_that_was_not_stopped(
         assert torch.equal(weights, halves.weights[name]), name
     assert "log_alpha" in whole.weights
     assert whole.weights["log_alpha"].item() < 0.0  # it has learned: it began with log 1
+
+
+def test_every_statistic_that_a_run_logs_is_explained(
+    learn_sac: Callable[..., Any], with_sac: Registries
+) -> None:
+    log = EventAccumulator(str(learn_sac().results / "toy")).Reload()
+    logged = {tag for tag in log.Tags()["scalars"] if tag.startswith(("Losses/", "Policy/"))}
+    assert logged == with_sac.trainers.get("sac").cls.tags.keys()  # type: ignore[attr-defined]
 
 
 def test_an_exported_policy_acts_and_names_the_plugin_where_that_is_missing(

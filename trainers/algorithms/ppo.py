@@ -101,7 +101,7 @@ class PPO(OnPolicyAlgorithm):
         "epsilon.",
         "Policy/Explained Variance": "Share of the returns' variance that the values before the "
         "update explain: 1 is all, under 0 is worse than their mean.",
-        "Policy/Learning Rate": "Of the policy, as scheduled.",
+        "Policy/Learning Rate": "Of the policy, as scheduled and as desired_kl scales it.",
         "Policy/Critic Learning Rate": "Of the critic, as scheduled.",
         "Policy/Epsilon": "How far the ratio of probabilities may move, as scheduled.",
         "Policy/Beta": "Weight of the entropy bonus, as scheduled.",

@@ -2,7 +2,16 @@
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    Field,
+    GetJsonSchemaHandler,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 # Which types know which field, and the value it has there when none is given.
 _DEFAULTS: dict[str, dict[str, float]] = {
@@ -44,6 +53,15 @@ class Schedule(BaseModel, frozen=True, extra="forbid"):
     @classmethod
     def _accept_shorthand(cls, data: Any) -> Any:
         return {"type": data} if isinstance(data, str) else data
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        """See pydantic: the mapping or the name alone, for editors."""
+        mapping = handler.resolve_ref_schema(handler(core_schema))
+        names = mapping["properties"]["type"]["enum"]
+        return {"description": mapping.pop("description"), "anyOf": [{"enum": names}, mapping]}
 
     @field_validator("power", "final_fraction")
     @classmethod

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, Field
+
 from trainers.runfile.yaml_document import (
     Document,
     KeyPath,
@@ -18,6 +20,17 @@ EXTENDS = "extends"
 OWN_KEYS = "x-"
 """Beginning of keys at the top that are for the user's own use, for anchors above all."""
 TYPE_KEYS = ("type", "trainer_type")
+
+
+class Extending(BaseModel, frozen=True, extra="forbid"):
+    """What a run file has beside its sections, until its base is read."""
+
+    extends: str | None = Field(
+        None,
+        min_length=1,
+        description="Another run file, as seen from this one: what it says holds where this one "
+        "says nothing.",
+    )
 
 
 def read_run_file(path: Path) -> Document:

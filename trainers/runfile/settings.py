@@ -126,7 +126,7 @@ class EvaluationSettings(BaseModel, frozen=True, extra="forbid"):
     stop_when: Target | None = Field(None, description="Ends the run before max_steps.")
 
 
-class _RunFile(BaseModel, frozen=True, extra="forbid"):
+class RunFile(BaseModel, frozen=True, extra="forbid"):
     """The top of the run file; a section left empty is as good as absent."""
 
     environment: dict[str, Any] = Field(description="The environment: its type and settings.")
@@ -150,7 +150,9 @@ class _RunFile(BaseModel, frozen=True, extra="forbid"):
     device: str = Field("cpu", min_length=1, description="Device of the networks, as torch has it.")
 
 
-class _Weight(BaseModel, frozen=True, extra="forbid"):
+class Weight(BaseModel, frozen=True, extra="forbid"):
+    """What stands beside a reward's own settings."""
+
     weight: float = Field(1.0, description="Factor of the reward in the sum.")
 
 
@@ -231,7 +233,7 @@ class _Sections:
             self.problem(path, "should be a finite number")
         if self.problems:
             raise SettingsError(self.problems)
-        top = self.validate(_RunFile, self.document.data, ())
+        top = self.validate(RunFile, self.document.data, ())
         # The sections are looked at even where the top is wrong, to tell everything at once.
         found = self.registries
         environment = self.component("environment", found.environments)
@@ -289,7 +291,7 @@ class _Sections:
             own = {key: value for key, value in section.items() if key != "weight"}
             weighed = {key: value for key, value in section.items() if key == "weight"}
             component = self.section(path, own, self.registries.rewards, beside=("weight",))
-            weight = self.validate(_Weight, weighed, path)
+            weight = self.validate(Weight, weighed, path)
             if component is None or weight is None:
                 continue
             earlier = first.setdefault(component.name, index)

@@ -1,16 +1,15 @@
-"""The plugin manager, the registries, and the listing."""
+"""The plugin manager and the registries."""
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import pytest
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 from torch import nn
 
 from envs.environment import Environment
@@ -19,7 +18,6 @@ from trainers import plugins as command
 from trainers.common.trainer_settings import TrainerSettings
 from trainers.hookspecs import hookimpl
 from trainers.runfile import registry as plugins
-from trainers.runfile.listing import component_rows, type_name
 from trainers.runfile.registry import (
     Origin,
     PluginError,
@@ -343,127 +341,6 @@ def test_the_failure_of_an_installed_plugin_names_its_distribution(
     message = refused("rewards.plugin")
     assert re.match(r"plugin '(mine|also)' \(their-dist 2\.5\): ", message)
     assert reason in message
-
-
-class Inner(BaseModel, frozen=True, extra="forbid"):
-    rate: float = Field(1e-3, description="How fast.")
-
-
-class Described(BaseModel, frozen=True, extra="forbid"):
-    count: int = Field(description="How many.")
-    inner: Inner = Field(Inner(), description="The inside.")
-    memory: Inner | None = Field(None, description="Or none.")
-    many: dict[str, Inner] = Field({}, description="Any number.")
-    sizes: tuple[Annotated[int, Field(gt=0)], ...] = Field((1, 2), description="The sizes.")
-
-
-def test_the_listing_tells_kind_name_origin_and_settings() -> None:
-    described = component("Described", __call__=call, Settings=Described)
-    registries = load_registries(plugin_manager([plugin("fake", rewards={"mine": described})]))
-    (row,) = component_rows(registries)
-    settings = {setting.pop("name"): setting for setting in row.pop("settings")}
-    assert row == {"kind": "reward", "name": "mine", "plugin": "fake", "origin": "built-in"}
-    assert settings == {
-        "count": {
-            "type": "int",
-            "required": True,
-            "default": None,
-            "description": "How many.",
-        },
-        "inner": {
-            "type": "Inner",
-            "required": False,
-            "default": {"rate": 0.001},
-            "description": "The inside.",
-        },
-        "inner.rate": {
-            "type": "float",
-            "required": False,
-            "default": 0.001,
-            "description": "How fast.",
-        },
-        "memory": {
-            "type": "Inner | None",
-            "required": False,
-            "default": None,
-            "description": "Or none.",
-        },
-        "memory.rate": {
-            "type": "float",
-            "required": False,
-            "default": 0.001,
-            "description": "How fast.",
-        },
-        "many": {
-            "type": "dict[str, Inner]",
-            "required": False,
-            "default": {},
-            "description": "Any number.",
-        },
-        "many.*.rate": {
-            "type": "float",
-            "required": False,
-            "default": 0.001,
-            "description": "How fast.",
-        },
-        "sizes": {
-            "type": "tuple[int, ...]",
-            "required": False,
-            "default": [1, 2],
-            "description": "The sizes.",
-        },
-    }
-
-
-@pytest.mark.parametrize(
-    ("annotation", "text"),
-    [
-        (int, "int"),
-        (float | None, "float | None"),
-        (Literal["a", "b"], "'a' | 'b'"),
-        (dict[str, Annotated[int, "positive"]], "dict[str, int]"),
-        (list[tuple[float, float]], "list[tuple[float, float]]"),
-    ],
-)
-def test_types_are_written_short(annotation: Any, text: str) -> None:
-    assert type_name(annotation) == text
-
-
-@pytest.fixture
-def listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the command see the rewards and one reward with a bracketed type, and nothing else."""
-    described = component("Described", __call__=call, Settings=Described)
-    registries = load_registries(plugin_manager([plugin("fake", rewards={"mine": described})]))
-    monkeypatch.setattr(command, "load_registries", lambda: registries)
-
-
-@pytest.mark.usefixtures("listed")
-def test_the_command_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
-    assert command.main(["--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)
-    assert (row["kind"], row["name"], len(row["settings"])) == ("reward", "mine", 8)
-
-
-@pytest.mark.usefixtures("listed")
-def test_the_command_prints_plain_text_to_a_pipe(capsys: pytest.CaptureFixture[str]) -> None:
-    assert command.main([]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "reward mine (built-in)"
-    assert "  count: int = required  How many." in lines
-    assert "  sizes: tuple[int, ...] = [1, 2]  The sizes." in lines
-
-
-@pytest.mark.usefixtures("listed")
-def test_the_command_prints_a_table_to_a_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("COLUMNS", "120")
-    assert command.main([]) == 0
-    printed = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
-    assert "reward mine (built-in)" in printed
-    assert "tuple[int, ...]" in printed
-    assert "description" in printed
 
 
 def test_the_command_tells_a_plugins_failure(
