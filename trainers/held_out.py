@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any
-
-from torch import nn
 
 from trainers.common.errors import UserError, suggestion
 from trainers.common.timers import timed
 from trainers.evaluation import evaluate_policy, evaluation_environment
 from trainers.inference.policy import Policy
+from trainers.networks.network import evaluation_mode
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.figures import evaluation_tag, figure_values
 from trainers.runfile.settings import EvaluationSettings, RunSettings
@@ -119,7 +117,7 @@ class HeldOutEvaluation:
         policy = Policy(
             network, env.single_observation_space, env.single_action_space, settings.seed
         )
-        with timed("evaluation"), _evaluation_mode(network):
+        with timed("evaluation"), evaluation_mode(network):
             report = evaluate_policy(
                 policy, env, settings.episodes, settings.seed, stop_requested=self._stop_requested
             )
@@ -134,18 +132,6 @@ class HeldOutEvaluation:
                 f"evaluation.stop_when.metric: {target.metric!r} is not among the figures of this "
                 f"environment's evaluation; {suggestion(target.metric, known)}"
             )
-
-
-@contextmanager
-def _evaluation_mode(network: nn.Module) -> Iterator[None]:
-    """Evaluation mode for a network; afterwards each of its modules is in its own mode again."""
-    training = [module for module in network.modules() if module.training]
-    network.eval()
-    try:
-        yield
-    finally:
-        for module in training:
-            module.training = True
 
 
 def _check_interval(settings: EvaluationSettings, collection_steps: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import torch
@@ -24,6 +25,7 @@ from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import EpisodeBatch
 from trainers.experience.frames import frame_spaces
 from trainers.inference.construction import network_factory
+from trainers.inference.first_pass import check_first_pass
 from trainers.inference.metadata import Metadata
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.observations import is_image
@@ -63,6 +65,7 @@ class Session:
         stop_requested: Callable[[], bool] = lambda: False,
     ):
         device = resolve_device(run.device)
+        self._check_first_pass = partial(check_first_pass, run=run, registries=registries)
         self.curriculum = build_curriculum(run)
         self._parameters = run.environment_parameters
         self._curriculum_state: State = (
@@ -113,15 +116,20 @@ class Session:
         return RunPosition(self.env_runner.step_count, lesson, self.lesson_count)
 
     def reset(self) -> None:
-        """Begins the run's first episodes.
+        """Begins the run's first episodes, and passes what they show through the networks once.
 
         Raises:
-            UserError: there can be none with the environment's settings.
+            UserError: there can be none with the environment's settings; or what a plugin gives is
+                not what it says.
+            PluginFailure: a plugin's network fails.
         """
         try:
             self.env_runner.reset()
         except ValueError as error:
             raise UserError(f"environment: {error}") from error
+        self._check_first_pass(
+            self.algorithm.policy, self.env_runner.env, self.env_runner.observations
+        )
 
     def advance_curriculum(self, episodes: EpisodeBatch, run_fraction: float) -> bool:
         """Shows finished episodes to the curriculum; True if a new lesson begins.

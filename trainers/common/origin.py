@@ -59,6 +59,24 @@ def blaming_plugins() -> Iterator[None]:
         raise failure from error
 
 
+@contextmanager
+def blaming(origin: Origin) -> Iterator[None]:
+    """Turns what is raised where an installed plugin alone can be wrong into a failure of its.
+
+    Raises:
+        PluginFailure: for exceptions that are not made to be told. Those of built-in plugins stay
+            as they are.
+    """
+    try:
+        yield
+    except Exception as error:
+        points = importlib.metadata.entry_points(group=PROJECT_NAME)
+        point = next((point for point in points if origin_of(point) == origin), None)
+        if point is None or is_told(error):
+            raise
+        raise _failure(point, error) from error
+
+
 def is_told(error: BaseException) -> bool:
     """Whether the message of an exception says it all, so that no traceback need be shown."""
     if isinstance(error, (UserError, Failure)):
@@ -81,11 +99,21 @@ def _plugin_failure(error: BaseException) -> PluginFailure | None:
     plugins = {point.module.partition(".")[0]: point for point in points}
     packages = [_package(frame) for frame, _ in traceback.walk_tb(error.__traceback__)]
     nearest = next((p for p in reversed(packages) if p in plugins or p in PACKAGES), None)
-    if nearest not in plugins:
-        return None
-    entries = zip(packages, traceback.extract_tb(error.__traceback__), strict=True)
-    own = [entry for package, entry in entries if package == nearest]
-    return PluginFailure(origin_of(plugins[nearest]), error, "".join(traceback.format_list(own)))
+    return _failure(plugins[nearest], error) if nearest in plugins else None
+
+
+def _failure(point: importlib.metadata.EntryPoint, error: BaseException) -> PluginFailure:
+    """An exception as the failure of a plugin, with the lines of its package."""
+    own = [
+        entry
+        for (frame, _), entry in zip(
+            traceback.walk_tb(error.__traceback__),
+            traceback.extract_tb(error.__traceback__),
+            strict=True,
+        )
+        if _package(frame) == point.module.partition(".")[0]
+    ]
+    return PluginFailure(origin_of(point), error, "".join(traceback.format_list(own)))
 
 
 def _package(frame: FrameType) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from numbers import Integral
 from typing import Any, TypeVar
 
 import gymnasium
@@ -15,7 +16,7 @@ from trainers.networks.factory import NetworkFactory
 from trainers.networks.network import NetworkSettings
 from trainers.networks.observations import is_frame
 from trainers.networks.policy_network import PolicyNetwork
-from trainers.runfile.registry import Registry
+from trainers.runfile.registry import PluginError, Registry
 from trainers.runfile.settings import Component
 from trainers.saving.serialization import mismatch
 
@@ -45,6 +46,8 @@ def network_factory(
 
     Raises:
         UserError: the run file names an observation that there is not.
+
+    What it builds raises a PluginError for an encoder without a `features_dim`.
     """
 
     def build_encoder(
@@ -55,6 +58,13 @@ def network_factory(
             encoder: nn.Module = component.cls(space, component.settings)
         except ValueError as error:
             raise UserError(f"encoders.{name} ({component.name}): {error}") from error
+        size = getattr(encoder, "features_dim", None)
+        if not (isinstance(size, Integral) and size > 0):
+            raise PluginError(
+                registry.get(component.name).origin,
+                f"encoder '{component.name}': its features_dim is {size!r}, and should be a whole "
+                "number over 0: how many features there are",
+            )
         return encoder
 
     factory = NetworkFactory(observation_space, action_space, build_encoder, privileged)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, ItemsView, Iterator, KeysView, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import gymnasium
@@ -182,6 +182,18 @@ class Network(nn.Module):
         for name, encoder in self.vector_encoders.items():
             if name in vectors and isinstance(encoder, Standardizing):
                 encoder.update_statistics(vectors[name])
+
+
+@contextmanager
+def evaluation_mode(network: nn.Module) -> Iterator[None]:
+    """Evaluation mode for a network; afterwards each of its modules is in its own mode again."""
+    training = [module for module in network.modules() if module.training]
+    network.eval()
+    try:
+        yield
+    finally:
+        for module in training:
+            module.training = True
 
 
 def _joined(parts: Sequence[Tensor]) -> Tensor:
