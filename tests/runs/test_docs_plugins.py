@@ -15,24 +15,30 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from curricula.curriculum import FinishedEpisodes
 from trainers import evaluation
 from trainers import run as run_module
 from trainers.algorithms.off_policy import OffPolicyAlgorithm
 from trainers.evaluation import evaluate
+from trainers.experience.env_runner import Step
 from trainers.hookspecs import hookimpl
+from trainers.networks.observations import Observations
 from trainers.runfile.registry import (
     BUILT_IN_PLUGINS,
     Registries,
     load_registries,
     plugin_manager,
 )
+from trainers.runfile.settings import load_run
 from trainers.saving.checkpoint import Checkpoints
+from trainers.session import Session
 
 REPOSITORY = Path(__file__).parents[2]
 PAGE = (REPOSITORY / "docs/plugins.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+REINFORCE = '"""REINFORCE'
 SAC_SECTION = PAGE[PAGE.index("### `ventosa_trainers`") :]
 
 
@@ -49,8 +55,10 @@ def shown() -> SimpleNamespace:
         '"""The curriculum `ladder`',
         '"""The environment `darts`',
         "from envs.evaluation import",
+        REINFORCE,
     ):
-        exec(block(beginning), known)
+        # Without this module's own future statements.
+        exec(compile(block(beginning), "plugins.md", "exec", dont_inherit=True), known)
     return SimpleNamespace(**known)
 
 
@@ -66,6 +74,10 @@ def with_shown(shown: SimpleNamespace) -> Registries:
         @hookimpl
         def ventosa_environments(self) -> dict[str, type]:
             return {"darts": shown.Darts, "judged_darts": shown.JudgedDarts}
+
+        @hookimpl
+        def ventosa_trainers(self) -> dict[str, type]:
+            return {"reinforce": shown.Reinforce}
 
     return load_registries(plugin_manager((*BUILT_IN_PLUGINS, Page())))
 
@@ -176,6 +188,63 @@ def test_judged_darts_are_judged_as_is_said_of_them(
     assert judged.figures["distance_m"].shown(0.0123) == "1.23 cm"
 
 
+# -- the algorithm from nothing ------------------------------------------------------------------
+
+
+@pytest.fixture
+def reinforce_run(tmp_path: Path) -> Path:
+    path = tmp_path / "pole.yaml"
+    environment = {"type": "gymnasium", "id": "CartPole-v1", "num_envs": 2}
+    trainer = {"trainer_type": "reinforce", "time_horizon": 8, "max_steps": 64}
+    path.write_text(yaml.safe_dump({"environment": environment, "trainer": trainer}))
+    return path
+
+
+def test_reinforce_weighs_each_action_by_what_followed_it(
+    reinforce_run: Path, with_shown: Registries
+) -> None:
+    run = load_run(reinforce_run, ["trainer.gamma=0.5"], with_shown)
+    session = Session(run, with_shown)
+    algorithm: Any = session.algorithm
+    seen = [
+        Observations({}, {"observation": torch.randn(2, 4, generator=torch.manual_seed(seed))})
+        for seed in (0, 1)
+    ]
+    actions = torch.tensor([[0, 1], [1, 1]])
+    rewards, ends = np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[False, True], [False, False]])
+    no = np.zeros(2, bool)
+    algorithm._collected = [
+        (seen[t], actions[t], Step(rewards[t], ends[t], no, no, None)) for t in (0, 1)
+    ]
+    follows = [[1.0 + 0.5 * 3.0, 2.0], [3.0, 4.0]]
+    chosen = [
+        algorithm.policy.log_probs(seen[t])[n, actions[t, n]].item() for t in (0, 1) for n in (0, 1)
+    ]
+    expected = -np.mean(np.array(chosen) * np.ravel(follows))
+    statistics = algorithm.update(0.0)
+    session.close()
+    assert statistics == {"Losses/Policy Loss": pytest.approx(expected, rel=1e-5)}
+    assert statistics.keys() == algorithm.tags.keys()
+
+
+def test_what_reinforce_learned_goes_on_exactly(
+    reinforce_run: Path,
+    learn: Callable[..., Any],
+    with_shown: Registries,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(run_module, "load_registries", lambda: with_shown)
+    results = learn(reinforce_run, "--run-id", "whole").results
+    learn(reinforce_run, "--run-id", "halves", "trainer.max_steps=32")
+    resumed = learn(reinforce_run, "--run-id", "halves", "--resume")
+    assert resumed.code == 0, resumed.errors
+    whole, halves = (
+        Checkpoints(results / name / "checkpoints", keep=1).load_latest().weights
+        for name in ("whole", "halves")
+    )
+    assert all(torch.equal(whole[name], halves[name]) for name in whole)
+
+
 def test_darts_refuse_rewards_and_unknown_parameters(shown: SimpleNamespace) -> None:
     settings = shown.Darts.Settings(num_envs=2)
     with pytest.raises(ValueError, match="leave `rewards` out"):
@@ -196,6 +265,7 @@ def test_the_algorithm_is_shown_as_it_is() -> None:
     files = (REPOSITORY / "examples/ventosa-sac-plugin/ventosa_sac").glob("*.py")
     source = "\n".join(unindented(path.read_text()) for path in files)
     excerpts = re.findall(r"```python\n(.*?)```", SAC_SECTION, re.DOTALL)
+    excerpts.remove(block(REINFORCE))
     assert len(excerpts) == 6
     for excerpt in excerpts:
         assert unindented(excerpt) in source
@@ -213,9 +283,13 @@ def test_the_tables_name_every_field_of_what_goes_to_and_fro() -> None:
         "Observations",
         "FrameFeatures",
         "Step",
+        "CollectedStep",
+        "BehaviorOutput",
         "Rollout",
         "EpisodeBatch",
         "FinishedEpisodes",
+        "GymTransition",
+        "GraspTransition",
     }
     for name, (module, text) in described.items():
         cls = getattr(importlib.import_module(module), name)

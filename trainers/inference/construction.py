@@ -59,7 +59,7 @@ def network_factory(
         except ValueError as error:
             raise UserError(f"encoders.{name} ({component.name}): {error}") from error
         size = getattr(encoder, "features_dim", None)
-        if not (isinstance(size, Integral) and size > 0):
+        if not (isinstance(size, Integral) and int(size) > 0):
             raise PluginError(
                 registry.get(component.name).origin,
                 f"encoder '{component.name}': its features_dim is {size!r}, and should be a whole "
