@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field, create_model
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
-from trainers.runfile.inheritance import EXTENDS, Extending
+from trainers.runfile.inheritance import EXTENDS, OWN_KEYS, Extending
 from trainers.runfile.listing import first_sentence
 from trainers.runfile.registry import Registries, Registry
 from trainers.runfile.settings import TRAINER_TYPE_KEY, TYPE_KEY, RunFile, Weight
@@ -46,6 +46,7 @@ def run_schema(registries: Registries) -> dict[str, Any]:
     return {
         "$schema": DIALECT,
         **schema,
+        "patternProperties": {f"^{OWN_KEYS}": {"description": "The file's own, for anchors."}},
         "if": {"not": {"required": [EXTENDS]}},
         "then": {
             "required": [

@@ -139,7 +139,7 @@ def test_a_name_of_nothing_is_told_with_the_nearest(registries: Registries) -> N
 
 @pytest.fixture
 def _listed(mine: Registries, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "load_registries", lambda: mine)
+    monkeypatch.setattr("trainers.runfile.registry.load_registries", lambda: mine)
 
 
 @pytest.mark.usefixtures("_listed")
@@ -166,7 +166,7 @@ def test_on_a_terminal_everything_fits_and_nothing_is_cut(
     monkeypatch: pytest.MonkeyPatch,
     width: int,
 ) -> None:
-    monkeypatch.setattr(command, "load_registries", lambda: registries)
+    monkeypatch.setattr("trainers.runfile.registry.load_registries", lambda: registries)
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("COLUMNS", str(width))
     assert command.main([]) == 0

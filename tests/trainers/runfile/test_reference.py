@@ -36,7 +36,7 @@ def test_the_page_is_what_the_command_in_it_writes(
     built_in: Registries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert COMMAND in PAGE
-    monkeypatch.setattr(command, "load_registries", lambda: built_in)
+    monkeypatch.setattr("trainers.runfile.registry.load_registries", lambda: built_in)
     assert command.main(["--reference", str(tmp_path / "reference.md")]) == 0
     written = (tmp_path / "reference.md").read_text()
     assert written == PAGE, f"out of date; write it anew: {COMMAND}"

@@ -349,7 +349,7 @@ def test_the_command_tells_a_plugins_failure(
     def fail() -> None:
         raise PluginError(Origin("mine", "their-dist 2.5"), "is broken")
 
-    monkeypatch.setattr(command, "load_registries", fail)
+    monkeypatch.setattr("trainers.runfile.registry.load_registries", fail)
     assert command.main([]) == 2
     assert capsys.readouterr().err == "error: plugin 'mine' (their-dist 2.5): is broken\n"
 

@@ -55,7 +55,7 @@ def test_the_committed_schemas_are_what_the_command_writes(
     flag: str,
     file: str,
 ) -> None:
-    monkeypatch.setattr(command, "load_registries", lambda: built_in)
+    monkeypatch.setattr("trainers.runfile.registry.load_registries", lambda: built_in)
     assert command.main([flag, str(tmp_path / "schema.json")]) == 0
     written = (tmp_path / "schema.json").read_text()
     assert written == (CONFIG / file).read_text(), f"out of date; write it anew: {REWRITE}"
@@ -153,6 +153,11 @@ def test_values_are_judged_as_the_program_does(
     document.set(key, value, "here")
     assert validator.is_valid(document.data) == fits
     assert is_taken(document.data, built_in) == fits
+
+
+def test_keys_of_the_files_own_are_taken(validator: Draft202012Validator) -> None:
+    assert validator.is_valid({**CARTPOLE, "x-rates": {"slow": 1e-4}})
+    assert not validator.is_valid({**CARTPOLE, "y-rates": {"slow": 1e-4}})
 
 
 def test_what_extends_another_file_may_leave_anything_out_and_mistype_nothing(
