@@ -63,7 +63,7 @@ def optimizer_step(
     learned = [parameter for parameter in parameters if parameter.requires_grad]
     gradients = torch.autograd.grad(loss, learned, allow_unused=True)
     for parameter, gradient in zip(learned, gradients, strict=True):
-        parameter.grad = gradient
+        parameter.grad = gradient if gradient is None else _laid_out_as(parameter, gradient)
     norm = nn.utils.get_total_norm([part for part in gradients if part is not None])
     if math.isfinite(max_gradient_norm):
         nn.utils.clip_grads_with_norm_(learned, max_gradient_norm, norm)
@@ -72,6 +72,17 @@ def optimizer_step(
     optimizer.found_inf = 1.0 - loss_and_norm.isfinite().all().float()  # type: ignore[attr-defined]
     optimizer.step()
     return loss_and_norm
+
+
+def _laid_out_as(parameter: nn.Parameter, gradient: Tensor) -> Tensor:
+    """A gradient with its parameter's order in memory.
+
+    That of a convolution's weights comes as its images lie, channels last; and a fused optimizer
+    goes through the memory of both side by side, whatever their strides are.
+    """
+    if gradient.stride() == parameter.stride():
+        return gradient
+    return torch.empty_like(parameter, requires_grad=False).copy_(gradient)
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:

@@ -92,3 +92,17 @@ def test_an_optimizer_goes_back_to_its_own_state_alone() -> None:
     del state["param_groups"][0]["betas"]
     with pytest.raises(ValueError, match="the optimizer's state has no betas"):
         load_optimizer(stepped_adam(2), state)
+
+
+def test_each_weight_of_a_convolution_goes_down_its_own_gradient() -> None:
+    """Its images lie with their channels last, and so does its gradient as autograd gives it."""
+    torch.manual_seed(0)
+    convolution = nn.Conv2d(3, 4, 2)
+    images = torch.randn(5, 6, 6, 3).permute(0, 3, 1, 2)
+    loss = convolution(images).square().mean()
+    (gradient,) = torch.autograd.grad(loss, [convolution.weight], retain_graph=True)
+    before = convolution.weight.detach().clone()
+    assert gradient.stride() != before.stride()
+    optimizer = torch.optim.SGD([convolution.weight], lr=1.0, fused=True)
+    optimizer_step(optimizer, loss, [convolution.weight], INFINITE)
+    assert torch.equal(convolution.weight, before - gradient)
