@@ -25,7 +25,13 @@ ROOMS = {
         "trainers.runfile",
         "trainers.common",
     },
-    "trainers.reporting": {"trainers.experience", "trainers.networks", "trainers.common"},
+    "trainers.loggers": {"trainers.common"},
+    "trainers.reporting": {
+        "trainers.experience",
+        "trainers.networks",
+        "trainers.loggers",
+        "trainers.common",
+    },
     "trainers.comparison": {
         "trainers.reporting",
         "trainers.saving",

@@ -88,6 +88,11 @@ class HeldOutEvaluation:
         log.scalars(_tagged(self.latest), self.latest["step"])
 
     @property
+    def tags(self) -> tuple[str, ...]:
+        """The tags of its curves."""
+        return tuple(_tagged(self.latest))
+
+    @property
     def scored_by(self) -> str:
         """Figure that policies are scored by."""
         return next(name for name in BEST_BY if name in self.latest)

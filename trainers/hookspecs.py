@@ -1,4 +1,4 @@
-"""The hooks of plugins: five, one per kind of component.
+"""The hooks of plugins: six, one per kind of component.
 
 A plugin is a module, named by an entry point of the group `ventosa`, that implements one or more
 of these hooks with `hookimpl`. Each hook returns a mapping from the component's name, which the run
@@ -63,4 +63,13 @@ def ventosa_trainers() -> dict[str, type]:  # type: ignore[empty-body]
 
     It follows `trainers.algorithms.base.Algorithm`, and its settings extend
     `trainers.algorithms.base.TrainerSettings`.
+    """
+
+
+@hookspec
+def ventosa_loggers() -> dict[str, type]:  # type: ignore[empty-body]
+    """Offer loggers: name -> `trainers.common.logger.Logger` subclass.
+
+    It is built as `cls(settings, run)` when a run begins, and is given what the run reports. What
+    it raises does not end the run.
     """

@@ -26,7 +26,7 @@ from trainers.common.timers import Timer, recording
 from trainers.held_out import HeldOutEvaluation
 from trainers.inference.construction import check_weights, load_weights
 from trainers.inference.metadata import FILE as METADATA
-from trainers.reporting.event_log import RunLog
+from trainers.reporting.event_log import LoggerChoice, RunLog
 from trainers.reporting.overview import (
     aligned,
     memory,
@@ -41,7 +41,7 @@ from trainers.reporting.summary import Summary
 from trainers.reporting.terminal import make_display
 from trainers.runfile.changes import changeable, changes
 from trainers.runfile.registry import Registries, load_registries
-from trainers.runfile.settings import RunSettings, dump_yaml, load_run
+from trainers.runfile.settings import RunSettings, dump_yaml, load_run, resolved
 from trainers.runfile.trust import needs_trust
 from trainers.saving.checkpoint import Checkpoints, Loaded
 from trainers.saving.run_folder import (
@@ -124,7 +124,7 @@ def _learn(
     directory = checkpoints.directory.parent
     run_id = directory.name
     with (
-        closing(RunLog(directory, start if resumed else None)) as log,
+        closing(RunLog(directory, start if resumed else None, _loggers(run))) as log,
         make_display(run_id, settings.max_steps, session.lesson_count, start) as display,
         _timers_written(directory),
     ):
@@ -134,6 +134,8 @@ def _learn(
         env = session.env_runner.env
         steps = (settings.max_steps, settings.summary_freq, start)
         summary = Summary(log, run_id, env, *steps, pace)
+        tags = (*summary.compared_tags, *(held_out.tags if held_out is not None else ()))
+        log.hyperparameters(resolved(run), tags)
         if held_out is not None:
             # A checkpoint has no score where its evaluation was cut off: it is made up for.
             if held_out.begins_due and (resumed is None or resumed.score is None):
@@ -181,7 +183,10 @@ def check_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) 
 
 def _load_run(options: argparse.Namespace) -> tuple[RunSettings, Registries]:
     registries = load_registries()
-    return load_run(options.config, options.overrides + _flags(options), registries), registries
+    run = load_run(options.config, options.overrides + _flags(options), registries)
+    for logger in run.loggers:
+        logger.cls.check(logger.settings)
+    return run, registries
 
 
 def _tell(*lines: str) -> None:
@@ -238,6 +243,10 @@ def _pace(
         return Pace(start, settings.max_steps)
     evaluation_s = 0.0 if compilation.happened else held_out.took_s
     return Pace(start, settings.max_steps, run.evaluation.interval, evaluation_s)
+
+
+def _loggers(run: RunSettings) -> dict[str, LoggerChoice]:
+    return {logger.name: (logger.cls, logger.settings) for logger in run.loggers}
 
 
 @contextmanager

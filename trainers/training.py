@@ -49,7 +49,7 @@ class Training:
     Args:
         session: what learns.
         settings: how long, and how often to save.
-        log: TensorBoard and status.json.
+        log: the loggers and status.json.
         summary: gathers statistics for it.
         checkpoints: where the run is saved.
         display: the terminal.

@@ -82,6 +82,29 @@ def with_shown(shown: SimpleNamespace) -> Registries:
     return load_registries(plugin_manager((*BUILT_IN_PLUGINS, Page())))
 
 
+# -- the logger ----------------------------------------------------------------------------------
+
+
+def test_the_logger_leaves_a_table_in_the_runs_folder(
+    monkeypatch: pytest.MonkeyPatch, write_run: Callable[..., Path], learn: Callable[..., Any]
+) -> None:
+    known: dict[str, Any] = {"__name__": "shown"}
+    exec(block('"""The logger `table`'), known)
+
+    class Page:
+        @hookimpl
+        def ventosa_loggers(self) -> dict[str, type]:
+            return {"table": known["Table"]}
+
+    found = load_registries(plugin_manager((*BUILT_IN_PLUGINS, Page())))
+    monkeypatch.setattr(run_module, "load_registries", lambda: found)
+    pole = {"type": "gymnasium", "id": "CartPole-v1", "num_envs": 2}
+    done = learn(write_run(pole, {"summary_freq": 32}, loggers=[{"type": "table"}]))
+    lines = [line.split(",") for line in (done.results / "toy/curves.csv").read_text().splitlines()]
+    assert "Environment/Cumulative Reward" in {tag for _, tag, _ in lines}
+    assert sorted({int(step) for step, *_ in lines})[-1] <= 64
+
+
 # -- the curriculum ------------------------------------------------------------------------------
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
-from trainers.reporting.event_files import PATTERN
+from trainers.loggers.event_files import PATTERN
 from trainers.saving.checkpoint import Checkpoints, Loaded
 from trainers.saving.run_lock import LOCK
 

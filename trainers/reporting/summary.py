@@ -1,4 +1,4 @@
-"""Reports of a run: TensorBoard, status.json and the terminal."""
+"""Reports of a run: its loggers, status.json and the terminal."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from trainers.reporting.terminal import RunStatus, TerminalDisplay
 
 REWARD_TAG = "Environment/Cumulative Reward"
 SUCCESS_TAG = "Environment/Success Rate"
+LENGTH_TAG = "Environment/Episode Length"
 SUMMARIES_PER_PICTURE = 10
 
 
@@ -45,7 +46,7 @@ class Summary:
     """Gathers statistics, and reports them every `summary_freq` steps.
 
     Args:
-        log: TensorBoard and status.json.
+        log: the loggers and status.json.
         run_id: the run's name.
         env: what is observed, and how its figures are called.
         max_steps: steps of the whole run.
@@ -78,6 +79,12 @@ class Summary:
         self._checkpoint: str | None = None
         self._evaluation: dict[str, Any] | None = None
 
+    @property
+    def compared_tags(self) -> tuple[str, ...]:
+        """The tags of the curves of episodes, whose last points runs are compared by."""
+        metrics = (metric_tag(figure.metric, self._figures) for figure in self._figures)
+        return (REWARD_TAG, LENGTH_TAG, SUCCESS_TAG, *metrics)
+
     def add(self, statistics: Mapping[str, float]) -> None:
         """Adds the statistics of an update."""
         self._averager.add(statistics)
@@ -88,7 +95,7 @@ class Summary:
             return
         means = {
             REWARD_TAG: episodes.rewards.mean(),
-            "Environment/Episode Length": episodes.lengths.mean(),
+            LENGTH_TAG: episodes.lengths.mean(),
             **{f"Reward/{name}": total.mean() for name, total in episodes.terms.items()},
             **{
                 metric_tag(name, self._figures): values.mean()
@@ -173,7 +180,7 @@ class Summary:
     def _show_observations(self, observations: Mapping[str, NDArray[Any]], step: int) -> None:
         for name, space in self._frame_spaces.items():
             frame = np.asarray(observations[name][0])
-            self._log.images(f"Observations/{name}", picture(space, frame), step)
+            self._log.image(f"Observations/{name}", picture(space, frame), step)
 
     def _line(self, position: RunPosition) -> RunStatus:
         return RunStatus(

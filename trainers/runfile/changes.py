@@ -18,22 +18,22 @@ def changes(begun: RunSettings, now: RunSettings) -> list[str]:
     return [
         f"{dotted(path)}: {shown(before)} then, {shown(after)} now"
         for path, before, after in differences(resolved(begun), resolved(now))
-        if dotted(path[:2]) not in free
+        if free.isdisjoint({dotted(path[:1]), dotted(path[:2])})
     ]
 
 
 def changeable(run: RunSettings) -> set[str]:
     """Dotted paths of the settings that say how a run is computed or reported, not what it learns.
 
-    Those are the device, and what the settings of environment, trainer and evaluation have in a
-    class variable `changeable_keys`.
+    Those are the device, the loggers, and what the settings of environment, trainer and evaluation
+    have in a class variable `changeable_keys`.
     """
     sections = {
         "environment": run.environment.settings,
         "trainer": run.trainer.settings,
         "evaluation": run.evaluation,
     }
-    return {"device"} | {
+    return {"device", "loggers"} | {
         f"{name}.{key}"
         for name, settings in sections.items()
         for key in getattr(settings, "changeable_keys", ())

@@ -21,6 +21,7 @@ from torch import nn
 from envs.environment import Environment
 from trainers import hookspecs
 from trainers.common.errors import UserError, suggestion
+from trainers.common.logger import Logger
 from trainers.common.origin import Origin, origin_of
 from trainers.common.trainer_settings import TrainerSettings
 
@@ -96,6 +97,7 @@ class Registries:
     curricula: Registry
     environments: Registry
     trainers: Registry
+    loggers: Registry
 
 
 class PluginManager(pluggy.PluginManager):
@@ -252,6 +254,12 @@ def trainer_breach(cls: type) -> str | None:
     return missing_method(cls, TRAINER_METHODS)
 
 
+def logger_breach(cls: type) -> str | None:
+    """Say how a logger breaks its contract, or None."""
+    fits = issubclass(cls, Logger)
+    return None if fits else f"{cls.__name__} is no trainers.common.logger.Logger"
+
+
 def missing_method(cls: type, names: Iterable[str]) -> str | None:
     """Say which method a class lacks first, or None."""
     missing = next((name for name in names if not callable(getattr(cls, name, None))), None)
@@ -264,6 +272,7 @@ KINDS: dict[str, tuple[str, Callable[[type], str | None]]] = {
     "curricula": ("curriculum", curriculum_breach),
     "environments": ("environment", environment_breach),
     "trainers": ("trainer", trainer_breach),
+    "loggers": ("logger", logger_breach),
 }
 """Field of `Registries` -> its kind, and what a class of that kind must keep to."""
 

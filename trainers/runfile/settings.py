@@ -6,7 +6,7 @@ finds its class, and the class's own `Settings` model validates the section's ot
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -43,6 +43,7 @@ __all__ = [
 
 TYPE_KEY = "type"
 TRAINER_TYPE_KEY = "trainer_type"
+DEFAULT_LOGGERS = [{TYPE_KEY: "tensorboard"}]
 PARAMETERS = TypeAdapter(dict[str, ParameterValue])
 
 
@@ -78,6 +79,7 @@ class RunSettings:
     """Values that hold for the whole run, unless the curriculum sets them."""
     trainer: Component
     evaluation: EvaluationSettings | None
+    loggers: tuple[Component, ...]
     seed: int
     device: str
 
@@ -146,6 +148,9 @@ class RunFile(BaseModel, frozen=True, extra="forbid"):
     evaluation: EvaluationSettings | None = Field(
         None, description="Evaluation while the run learns; the best checkpoint is chosen by it."
     )
+    loggers: list[dict[str, Any]] | None = Field(
+        None, description="The loggers: type and settings of each; TensorBoard alone if absent."
+    )
     seed: int = Field(0, ge=0, lt=2**32, description="Seed of everything that is random.")
     device: str = Field("cpu", min_length=1, description="Device of the networks, as torch has it.")
 
@@ -202,6 +207,7 @@ def resolved(run: RunSettings) -> dict[str, Any]:
     data["environment_parameters"] = PARAMETERS.dump_python(run.environment_parameters, mode="json")
     data["trainer"] = _plain(run.trainer, TRAINER_TYPE_KEY)
     data["evaluation"] = run.evaluation and run.evaluation.model_dump(mode="json")
+    data["loggers"] = [_plain(logger) for logger in run.loggers]
     return {**data, "seed": run.seed, "device": run.device}
 
 
@@ -237,7 +243,7 @@ class _Sections:
         # The sections are looked at even where the top is wrong, to tell everything at once.
         found = self.registries
         environment = self.component("environment", found.environments)
-        rewards, encoders = self.rewards(), self.encoders()
+        rewards, encoders, loggers = self.rewards(), self.encoders(), self.loggers()
         curriculum = self.component("curriculum", found.curricula)
         trainer = self.component("trainer", found.trainers, TRAINER_TYPE_KEY)
         if self.problems or top is None or environment is None or trainer is None:
@@ -250,6 +256,7 @@ class _Sections:
             environment_parameters=top.environment_parameters or {},
             trainer=trainer,
             evaluation=top.evaluation,
+            loggers=tuple(loggers),
             seed=top.seed,
             device=top.device,
         )
@@ -281,25 +288,38 @@ class _Sections:
         return self.section((key,), section, registry, type_key)
 
     def rewards(self) -> list[WeightedReward]:
-        sections = self.document.data.get("rewards")
         rewards: list[WeightedReward] = []
-        first: dict[str, int] = {}
-        for index, section in enumerate(sections if isinstance(sections, list) else []):
-            if not isinstance(section, dict):
-                continue
-            path = ("rewards", index)
+        for path, section in self.entries("rewards"):
             own = {key: value for key, value in section.items() if key != "weight"}
             weighed = {key: value for key, value in section.items() if key == "weight"}
             component = self.section(path, own, self.registries.rewards, beside=("weight",))
             weight = self.validate(Weight, weighed, path)
-            if component is None or weight is None:
-                continue
-            earlier = first.setdefault(component.name, index)
-            if earlier != index:
-                message = f"'{component.name}' is there already, as rewards.{earlier}; keep one"
-                self.problem((*path, TYPE_KEY), message)
-            rewards.append(WeightedReward(component, weight.weight))
+            if component is not None and weight is not None:
+                rewards.append(WeightedReward(component, weight.weight))
         return rewards
+
+    def loggers(self) -> list[Component]:
+        found = [
+            self.section(path, section, self.registries.loggers)
+            for path, section in self.entries("loggers", DEFAULT_LOGGERS)
+        ]
+        return [logger for logger in found if logger]
+
+    def entries(
+        self, key: str, default: Sequence[dict[str, Any]] = ()
+    ) -> Iterator[tuple[KeyPath, dict[str, Any]]]:
+        """The sections of a list, each of another type; what is none was noted at the top."""
+        given = self.document.data.get(key)
+        sections = given if isinstance(given, list) else default if given is None else ()
+        first: dict[str, int] = {}
+        for index, section in enumerate(sections):
+            if not isinstance(section, dict):
+                continue
+            name = section.get(TYPE_KEY)
+            yield (key, index), section
+            if isinstance(name, str) and (earlier := first.setdefault(name, index)) != index:
+                message = f"'{name}' is there already, as {key}.{earlier}; keep one"
+                self.problem((key, index, TYPE_KEY), message)
 
     def section(
         self,

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from trainers.common.errors import UserError
 from trainers.common.files import write_atomically
+from trainers.common.logger import IDENTIFIERS
 from trainers.saving import checkpoint, evaluation_folder
 from trainers.saving.checkpoint import MANIFEST, Checkpoints, Loaded
 from trainers.saving.evaluation_folder import EVALUATION
@@ -18,7 +19,9 @@ from trainers.saving.run_lock import LOCK, RunLock
 CONFIGURATION = "configuration.yaml"
 CHECKPOINTS = "checkpoints"
 
-_NAMES = "|".join(map(re.escape, (CONFIGURATION, "policy.json", "status.json", "timers.json")))
+_NAMES = "|".join(
+    map(re.escape, (CONFIGURATION, IDENTIFIERS, "policy.json", "status.json", "timers.json"))
+)
 _FILE = re.compile(rf"{_NAMES}|\.({_NAMES})\.tmp|events\.out\.tfevents\..+")
 """Names of a run's own files, as `trainers.run` and its log write them."""
 _FOLDERS = {CHECKPOINTS: checkpoint.own_names, EVALUATION: evaluation_folder.own_names}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
@@ -18,7 +18,6 @@ from trainers.comparison.jobs import STOPPED, Ended, run, say
 from trainers.comparison.planning import PlannedRun
 from trainers.comparison.results import Curves, read_status
 from trainers.held_out import BEST_BY
-from trainers.reporting.event_log import RunLog
 from trainers.reporting.figures import evaluation_tag
 from trainers.runfile.registry import Registries
 from trainers.saving.run_folder import CONFIGURATION
@@ -126,11 +125,6 @@ class Trials:
         if ended.code in STOPPED and not watch.pruned:
             return  # the lock's file stays: the trial goes on another time
         self._tell(trial, ended, watch)
-        if watch.score is not None:
-            values = {key: _shown(value) for key, value in trial.params.items()}
-            # One log at a time: it minds what threads fail of.
-            with self._lock, closing(RunLog(folder)) as log:
-                log.hparams(values, [evaluation_tag(watch.score)])
         self._release(name, begun.lock)
 
     def _release(self, name: str, lock: RunLock) -> None:
@@ -224,11 +218,6 @@ class Watch:
 def _name(number: int) -> str:
     """Of a trial, and of its run's folder."""
     return f"trial-{number:04d}"
-
-
-def _shown(value: object) -> str | float:
-    """A setting's value as TensorBoard has it."""
-    return value if isinstance(value, (str, int, float)) else str(value)
 
 
 def _reason(ended: Ended) -> str:

@@ -63,8 +63,8 @@ def test_text_and_images(tmp_path: Path) -> None:
     picture = np.random.default_rng(0).integers(0, 256, (12, 20, 3), dtype=np.uint8)
     gray = picture[..., :1]
     log.text("Run/Configuration", "seed: **1**", step=0)
-    log.images("Camera/RGB", picture, step=3)
-    log.images("Camera/Depth", gray, step=3)
+    log.image("Camera/RGB", picture, step=3)
+    log.image("Camera/Depth", gray, step=3)
     log.close()
     accumulator = read_back(tmp_path)
     (text,) = accumulator.Tensors("Run/Configuration/text_summary")

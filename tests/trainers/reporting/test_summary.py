@@ -30,7 +30,7 @@ class Log:
     def scalars(self, values: dict[str, float], step: int) -> None:
         self.points[step] = dict(values)
 
-    def images(self, tag: str, image: np.ndarray, step: int) -> None:
+    def image(self, tag: str, image: np.ndarray, step: int) -> None:
         self.pictures.append((tag, image.shape, step))
 
     def status(self, values: dict[str, Any]) -> None:

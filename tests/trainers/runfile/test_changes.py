@@ -35,7 +35,11 @@ def test_how_long_it_runs_and_what_it_reports_may_change(
     }
     stop_when = {"metric": "reward", "at_least": 0.0}
     evaluation = {**EVALUATION, "interval": 99, "stop_when": stop_when}
-    assert told(make_run, "target", trainer, evaluation=evaluation, device="cuda") == []
+    rest = {"evaluation": evaluation, "device": "cuda"}
+    assert told(make_run, "target", trainer, **rest) == []
+    other = [{"type": "tensorboard"}, {"type": "mlflow", "experiment": "other"}]
+    assert told(make_run, "target", trainer, **rest, loggers=other) == []
+    assert told(make_run, "target", trainer, **rest, loggers=[]) == []
 
 
 @pytest.mark.parametrize(
@@ -90,7 +94,7 @@ def test_of_a_list_of_sections_the_innermost_value_is_named(
 
 def test_settings_say_which_of_theirs_may_change(make_run: Callable[..., RunSettings]) -> None:
     trainer = {f"trainer.{key}" for key in ("max_steps", "summary_freq", "checkpoint_interval")}
-    expected = {"device", "trainer.keep_checkpoints"} | trainer
+    expected = {"device", "loggers", "trainer.keep_checkpoints"} | trainer
     assert changeable(make_run("target")) == expected
     assert changeable(make_run("target", evaluation=EVALUATION)) == expected | {
         "evaluation.interval",

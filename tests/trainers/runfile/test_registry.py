@@ -15,6 +15,7 @@ from torch import nn
 from envs.environment import Environment
 from trainers import hookspecs
 from trainers import plugins as command
+from trainers.common.logger import Logger
 from trainers.common.trainer_settings import TrainerSettings
 from trainers.hookspecs import hookimpl
 from trainers.runfile import registry as plugins
@@ -76,12 +77,17 @@ class GoodTrainer:
     state_dict = load_state_dict = lambda self: None
 
 
+class GoodLogger(Logger):
+    Settings: ClassVar[type[BaseModel]] = Empty
+
+
 GOOD = {
     "encoders": GoodEncoder,
     "rewards": GoodReward,
     "curricula": GoodCurriculum,
     "environments": GoodEnvironment,
     "trainers": GoodTrainer,
+    "loggers": GoodLogger,
 }
 
 
@@ -214,6 +220,11 @@ def call(self: Any) -> None: ...
         *(
             ("trainers", component("T", GoodTrainer, **{name: None}), f"T has no method {name}")
             for name in ("build_policy", "collect", "update", "state_dict", "load_state_dict")
+        ),
+        (
+            "loggers",
+            component("L", Settings=Empty),
+            "L is no trainers.common.logger.Logger",
         ),
     ],
 )

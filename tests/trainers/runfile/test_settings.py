@@ -17,8 +17,10 @@ from torch import nn
 
 from curricula.samplers import UniformSampler
 from envs.environment import Environment
+from trainers.common.logger import Logger
 from trainers.common.trainer_settings import TrainerSettings
 from trainers.hookspecs import hookimpl
+from trainers.loggers.tensorboard import TensorBoard
 from trainers.runfile.registry import Registries, load_registries, plugin_manager
 from trainers.runfile.settings import RunSettings, SettingsError, dump_yaml, load_run, resolved
 from trainers.runfile.yaml_document import LARGEST_INTEGER, dump, parse
@@ -106,6 +108,11 @@ class Ppo:
         max_steps: int = Field(description="Steps of training in all.")
 
 
+class Note(Logger):
+    class Settings(BaseModel, frozen=True, extra="forbid"):
+        project: str = "none"
+
+
 class Fakes:
     @hookimpl
     def ventosa_environments(self) -> dict[str, type]:
@@ -126,6 +133,10 @@ class Fakes:
     @hookimpl
     def ventosa_trainers(self) -> dict[str, type]:
         return {"ppo": Ppo}
+
+    @hookimpl
+    def ventosa_loggers(self) -> dict[str, type]:
+        return {"tensorboard": TensorBoard, "note": Note}
 
 
 REGISTRIES: Registries = load_registries(plugin_manager([Fakes()]))
@@ -640,6 +651,22 @@ class TestInvalid:
             "run.yaml:8: rewards.2.type: 'touch' is there already, as rewards.0; keep one"
         ]
 
+    @pytest.mark.parametrize(
+        ("loggers", "expected"),
+        [
+            ("[{type: nite}]", "loggers.0.type: unknown logger 'nite'; did you mean 'note'? "),
+            ("[{type: note, projct: x}]", "loggers.0.projct: unknown key; did you mean 'project'?"),
+            (
+                "[{type: note}, {type: note, project: x}]",
+                "loggers.1.type: 'note' is there already, as loggers.0; keep one",
+            ),
+            ("note", "loggers: should be a list, not 'note'"),
+        ],
+    )
+    def test_loggers(self, loggers: str, expected: str) -> None:
+        (line,) = refused(f"{SMALL}loggers: {loggers}\n")
+        assert line.startswith(f"run.yaml:5: {expected}")
+
     def test_everything_that_is_wrong_is_told_at_once(self) -> None:
         lines = refused(
             "environment:\n"
@@ -799,6 +826,22 @@ class TestResolved:
             "keep_checkpoints": 5,
         }
         assert data["seed"] == 0
+
+    @pytest.mark.parametrize(
+        ("loggers", "expected"),
+        [
+            ("", [{"type": "tensorboard"}]),
+            ("loggers:\n", [{"type": "tensorboard"}]),
+            ("loggers: []\n", []),
+            ("loggers: [{type: note}]\n", [{"type": "note", "project": "none"}]),
+        ],
+    )
+    def test_loggers_are_tensorboard_alone_unless_they_are_named(
+        self, loggers: str, expected: list[dict[str, Any]]
+    ) -> None:
+        run = load(SMALL + loggers)
+        assert resolved(run)["loggers"] == expected
+        assert load(dump_yaml(run)) == run
 
     def test_it_is_plain_yaml(self) -> None:
         run = load(FULL)

@@ -133,9 +133,9 @@ def test_tensorboard_has_the_settings_that_were_tried(
     content = events.PluginTagToContent("hparams")
     begun = HParamsPluginData.FromString(content["_hparams_/session_start_info"])
     values = {name: value.number_value for name, value in begun.session_start_info.hparams.items()}
-    assert values == {RATE: trial.params[RATE], BATCH: trial.params[BATCH]}
+    assert values.items() >= {RATE: trial.params[RATE], BATCH: trial.params[BATCH]}.items()
     about = HParamsPluginData.FromString(content["_hparams_/experiment"]).experiment
-    assert [info.name.tag for info in about.metric_infos] == ["Evaluation/Reward"]
+    assert "Evaluation/Reward" in [info.name.tag for info in about.metric_infos]
 
 
 def test_an_interrupted_sweep_goes_on_as_if_it_had_not_been(

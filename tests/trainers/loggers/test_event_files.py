@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
-from trainers.reporting.event_files import PATTERN, cut_after
+from trainers.loggers.event_files import PATTERN, cut_after
 from trainers.reporting.event_log import RunLog
 
 
