@@ -90,7 +90,11 @@ class Unanswerable:
 
 
 class PhysicalCheck(Protocol):
-    """Carries out actions in a world with full physics, apart from the episodes."""
+    """Carries out actions in a world with full physics, apart from the episodes.
+
+    One that takes its time may count in an attribute `tried_out` the actions that it is through
+    with, since it was made: the terminal shows that.
+    """
 
     def __call__(self, actions: NDArray[Any]) -> dict[str, NDArray[np.bool_]]:
         """Tries out actions (n, ...) in the first n environments, whose episodes do not notice.

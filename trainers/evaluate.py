@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from trainers.evaluation import Evaluation
     from trainers.runfile.settings import Component
 
+STANDARD_OUTPUT = Path("-")
+
 
 @tells_failures
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -52,6 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         render=options.render,
         trust=options.trust,
     )
+    if options.json == STANDARD_OUTPUT:
+        print(json.dumps(evaluation.report, indent=2))
+        return DONE
     if options.json is not None:
         _write(options.json, evaluation.report)
     Console().print(table(options.policy, evaluation))
@@ -116,7 +121,9 @@ def _generic_options() -> argparse.ArgumentParser:
         metavar="DIR",
         help="draw pictures into DIR (default: evaluation/ in the run's folder)",
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here, too")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="write the figures here, too; - prints them alone"
+    )
     add_trust_option(parser)
     add_results_option(parser)
     return parser

@@ -32,6 +32,7 @@ from trainers.reporting.figures import (
     summaries,
     sureness_report,
 )
+from trainers.reporting.progress import check_progress
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import RunSettings, load_run, load_run_document
 from trainers.runfile.trust import check_imports
@@ -165,7 +166,8 @@ def evaluate(
             with _asked_for("--render"):
                 pictures = evaluator.pictures()
             into = EvaluationFolder(Path(render or folder / EVALUATION), pictures.file_names)
-        report = evaluate_policy(acting, env, count, seed, check=physical, pictures=pictures)
+        with check_progress(physical, evaluator.check_name, count):
+            report = evaluate_policy(acting, env, count, seed, check=physical, pictures=pictures)
         if pictures is not None and into is not None:
             into.write(report, pictures.files())
     return Evaluation(report, report_figures(evaluator))

@@ -68,6 +68,15 @@ def test_an_environment_without_measures_is_evaluated_by_its_rewards(
     assert "pick_rate" not in report
 
 
+def test_figures_are_printed_for_programs(
+    evaluate: Callable[..., Any], capfd: pytest.CaptureFixture[str]
+) -> None:
+    code, _, results = evaluate("target")
+    assert code == 0
+    assert main([str(results / "toy"), "--episodes", "6", "--json", "-"]) == 0
+    assert json.loads(capfd.readouterr().out) == json.loads((results / "report.json").read_text())
+
+
 def test_what_an_environment_can_not_show_is_told(evaluate: Callable[..., Any]) -> None:
     code, errors, results = evaluate("target", "--render")
     assert code == 2

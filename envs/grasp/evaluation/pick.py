@@ -135,22 +135,23 @@ class PickCheck:
     Args:
         picker: carries them out; it is closed with this.
         commands: where actions would lead in the running episodes.
+
+    Attributes:
+        tried_out: actions that it is through with.
     """
 
     def __init__(self, picker: Picker, commands: Callable[[NDArray[Any]], PoseCommands]):
         self._picker, self._pose_commands = picker, commands
+        self.tried_out = 0
 
     def __call__(self, actions: NDArray[Any]) -> dict[str, NDArray[np.bool_]]:
         """See `PhysicalCheck`; the names are those of `Outcome`."""
         commands = self._pose_commands(actions)
-        outcomes = np.array(
-            [
-                self._picker.pick(commands.scenes[row : row + 1], tooltip_m, float(yaw_rad))
-                for row, (tooltip_m, yaw_rad) in enumerate(
-                    zip(commands.tooltip_m, commands.yaw_rad, strict=True)
-                )
-            ]
-        )
+        outcomes = np.empty(len(commands), object)
+        for row, yaw_rad in enumerate(commands.yaw_rad):
+            scene, tooltip_m = commands.scenes[row : row + 1], commands.tooltip_m[row]
+            outcomes[row] = self._picker.pick(scene, tooltip_m, float(yaw_rad))
+            self.tried_out += 1
         return {str(outcome): outcomes == outcome for outcome in Outcome}
 
     def close(self) -> None:

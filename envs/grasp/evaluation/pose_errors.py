@@ -40,6 +40,20 @@ class PoseErrors:
         return PoseErrors(**{name: values[rows] for name, values in vars(self).items()})
 
     @property
+    def misses(self) -> Floats:
+        """(n,) the largest error in units of the goal region's own limit; to 1: none.
+
+        Where a physical check failed it is infinite.
+        """
+        region = self.region
+        half_gap_m = (region.gap_limit_m - region.gap_min_m) / 2.0
+        limits_m = np.stack([region.lateral_limit_m, region.vertical_limit_m, half_gap_m], axis=1)
+        position = np.max(np.abs(self.error_m) / limits_m, axis=1)
+        yaw = np.abs(self.yaw_error_deg) / region.yaw_limit_deg
+        failed = ~np.isin(self.outcome, ("", Outcome.SUCCESS))
+        return np.where(failed, np.inf, np.maximum(position, yaw))
+
+    @property
     def distance_m(self) -> Floats:
         """(n,) to the goal region's middle."""
         return np.asarray(np.linalg.norm(self.error_m, axis=1))

@@ -21,7 +21,7 @@ from envs.grasp.task import GoalRegion, block_offset, yaw_error
 Floats = NDArray[np.float64]
 
 SHOWN = 24
-FILMED = 4
+FILMED, WORST_FILMED = 4, 2
 NEEDED = ("matplotlib", "PIL")
 
 _logger = logging.getLogger("ventosa")
@@ -39,7 +39,13 @@ class GraspReport:
         ValueError: a package is missing.
     """
 
-    file_names: tuple[str, ...] = ("episodes.png", "errors.png", "workspace.png", "film.gif")
+    file_names: tuple[str, ...] = (
+        "episodes.png",
+        "worst.png",
+        "errors.png",
+        "workspace.png",
+        "film.gif",
+    )
 
     def __init__(
         self,
@@ -58,6 +64,7 @@ class GraspReport:
         self._camera = (depth or list(cameras))[0]
         self._errors: list[PoseErrors] = []
         self._samples: list[Sample] = []
+        self._worst: list[Sample] = []
         self._picked = False
 
     def add(self, actions: NDArray[Any], outcomes: Mapping[str, NDArray[np.bool_]]) -> None:
@@ -70,6 +77,9 @@ class GraspReport:
             self._sample(commands, errors, slice(row, row + 1))
             for row in range(min(len(commands), SHOWN - len(self._samples)))
         ]
+        worst = np.argsort(-errors.misses, kind="stable")[:SHOWN]
+        self._worst += [self._sample(commands, errors, slice(row, row + 1)) for row in worst]
+        self._worst = sorted(self._worst, key=lambda sample: -sample.errors.misses[0])[:SHOWN]
 
     def files(self) -> Iterator[tuple[str, bytes]]:
         """See `EvaluationReport`."""
@@ -77,8 +87,10 @@ class GraspReport:
         from envs.grasp.evaluation.plots import contact_sheet, error_histograms, workspace  # noqa: PLC0415
 
         errors, robot = _concatenate(self._errors), self._arm.robot
-        episodes, histograms, places, moving = self.file_names
+        episodes, worst, histograms, places, moving = self.file_names
+        filmed = [*self._samples[:FILMED], *self._worst[:WORST_FILMED]]
         yield episodes, contact_sheet(self._samples, robot.cup_radius_m)
+        yield worst, contact_sheet(self._worst, robot.cup_radius_m)
         yield histograms, error_histograms(errors)
         yield places, workspace(errors)
         if not has_pybullet():
@@ -86,7 +98,7 @@ class GraspReport:
             return
         from envs.grasp.evaluation.film import film  # noqa: PLC0415
 
-        yield moving, film(self._samples[:FILMED], self._settings, self._arm, self._picked)
+        yield moving, film(filmed, self._settings, self._arm, self._picked)
 
     def _sample(self, commands: PoseCommands, errors: PoseErrors, row: slice) -> Sample:
         view, image = commands.views[self._camera][row], commands.images[self._camera][row][0]
@@ -94,7 +106,8 @@ class GraspReport:
         return Sample(
             scene=commands.scenes[row],
             view=view,
-            image=cloud_camera(view.camera).image(image) if is_cloud else image,
+            # A copy: a view would keep the images of all episodes.
+            image=cloud_camera(view.camera).image(image) if is_cloud else image.copy(),
             tooltip_m=commands.tooltip_m[row][0],
             yaw_rad=float(commands.yaw_rad[row][0]),
             errors=errors[row],

@@ -197,6 +197,7 @@ def test_the_environment_picks_without_its_episodes_noticing(simulator: str) -> 
         outcomes = check(actions[:2])
         check.close()
         check.close()
+        assert check.tried_out == 2
         assert set(outcomes) == {str(outcome) for outcome in Outcome}
         np.testing.assert_array_equal(outcomes["success"], [True, False])
         np.testing.assert_array_equal(sum(rows.astype(int) for rows in outcomes.values()), [1, 1])

@@ -35,6 +35,7 @@ ARM = Arm.of(GraspSettings(), load_robot())
 def few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report_module, "SHOWN", SHOWN)
     monkeypatch.setattr(report_module, "FILMED", 1)
+    monkeypatch.setattr(report_module, "WORST_FILMED", 1)
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +69,27 @@ def test_errors_are_those_to_the_middle_of_the_goal_region(env: GraspVectorEnv) 
     assert len(report._samples) == SHOWN
     assert report._samples[0].caption == "10.8 mm, 3.0 deg   picked"
     assert report._samples[1].caption == "10.8 mm, 3.0 deg   no seal"
+
+
+def test_the_worst_are_those_that_failed_and_then_those_furthest_out(env: GraspVectorEnv) -> None:
+    report = env.evaluator().pictures()
+    # In the gap 0.0, 0.5, 1.0, ... of the limit of 5 mm off; later, 4 deg where 2 are allowed.
+    gap_m = -0.015 - 0.0025 * np.arange(ENVS)[:, None]
+    report.add(actions(env, ahead=gap_m, up=0.0, yaw_deg=0.0), {})  # type: ignore[arg-type]
+    picked = np.arange(ENVS) != 3
+    report.add(
+        actions(env, ahead=-0.015, up=0.0, yaw_deg=4.0), {"success": picked, "missed": ~picked}
+    )
+    misses = np.concatenate([errors.misses for errors in report._errors])
+    expected = [*(0.5 * np.arange(ENVS)), *np.where(picked, 4.0 / env_yaw_limit(report), np.inf)]
+    np.testing.assert_allclose(misses, expected, atol=1e-9)
+    assert [sample.errors.misses[0] for sample in report._worst] == sorted(misses)[::-1][:SHOWN]
+    assert report._worst[0].errors.outcome[0] == "missed"
+
+
+def env_yaw_limit(report: Any) -> float:
+    (limit,) = set(report._errors[0].region.yaw_limit_deg)
+    return float(limit)
 
 
 @pytest.mark.parametrize("checked", [True, False])
