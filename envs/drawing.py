@@ -40,7 +40,14 @@ def annotated(
             if pixels is not None:
                 corners = np.rint(pixels * factor).astype(np.int32)
                 cv2.polylines(canvas, [corners], False, color, thickness, cv2.LINE_AA)
-    band = np.full((TEXT_HEIGHT_PX, canvas.shape[1], 3), 255, np.uint8)
+    return captioned(canvas, caption)
+
+
+def captioned(picture: NDArray[np.uint8], caption: str) -> NDArray[np.uint8]:
+    """A picture (rows, columns, 3) with one line of text below; what is too long is cut off."""
+    import cv2  # noqa: PLC0415
+
+    band = np.full((TEXT_HEIGHT_PX, picture.shape[1], 3), 255, np.uint8)
     place, font = (6, TEXT_HEIGHT_PX - 8), cv2.FONT_HERSHEY_SIMPLEX
     cv2.putText(band, caption, place, font, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
-    return np.vstack([canvas, band])
+    return np.vstack([picture, band])

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, ClassVar
 
 import gymnasium
+import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from pydantic import BaseModel
@@ -57,6 +58,7 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
         evaluation_episodes: how many an evaluation plays unless it is told otherwise.
         evaluation_options: what `trainers.evaluate` offers for it, next to its own options.
         tags: what each of its episode metrics says, by TensorBoard tag, for the reference.
+        frames_per_second: at which its episodes can be filmed, see `film`; 0: they can't be.
     """
 
     name: str = ""
@@ -68,6 +70,7 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
     evaluation_episodes: ClassVar[int] = 100
     evaluation_options: ClassVar[tuple[EvaluationOption, ...]] = ()
     tags: ClassVar[Mapping[str, str]] = {}
+    frames_per_second: float = 0.0
     single_observation_space: gymnasium.spaces.Dict
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
@@ -117,6 +120,17 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
 
     def load_state_dict(self, state: dict[str, Any]) -> ObservationArrays:
         """Goes back to a state; returns the observations it was left with."""
+        raise NotImplementedError
+
+    def film(self, rows: Collection[int]) -> None:
+        """Takes a frame of these environments now and after each step, and none of the others."""
+        raise NotImplementedError
+
+    def pop_frames(self) -> dict[int, list[NDArray[np.uint8]]]:
+        """Frames (H, W, 3) since the last call, oldest first, by the rows that are filmed.
+
+        The last of an episode is there before the next begins, of which there is none.
+        """
         raise NotImplementedError
 
     def evaluator(self) -> Evaluator:

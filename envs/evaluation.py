@@ -166,6 +166,17 @@ class Evaluator:
         """
         raise ValueError("the environment has no pictures to show")
 
+    def drawn(self, actions: NDArray[Any]) -> NDArray[np.uint8] | None:
+        """Picture (H, W, 3) of what the first environments show, target and action drawn in.
+
+        Args:
+            actions: (n, ...) in the first n environments, before they are carried out.
+
+        Returns:
+            None: there is no such picture.
+        """
+        return None
+
     def unanswerable(self, count: int, seed: int) -> Iterator[Unanswerable]:
         """Observations of all kinds before which no action is right; the episodes do not notice.
 

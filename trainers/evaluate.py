@@ -118,6 +118,7 @@ def _generic_options() -> argparse.ArgumentParser:
         "--render",
         nargs="?",
         const="",
+        type=folder,
         metavar="DIR",
         help="draw pictures into DIR (default: evaluation/ in the run's folder)",
     )
@@ -224,6 +225,17 @@ def _write(path: Path, report: dict[str, Any]) -> None:
         write_atomically(path, json.dumps(report, indent=2) + "\n")
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}") from error
+
+
+def folder(text: str) -> str:
+    """A command line's folder.
+
+    Raises:
+        argparse.ArgumentTypeError: it is a KEY=VALUE, which was meant for the run file.
+    """
+    if "=" in text:
+        raise argparse.ArgumentTypeError(f"{text} is taken for its DIR: write it before --render")
+    return text
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -32,6 +33,7 @@ from trainers.reporting.figures import (
     summaries,
     sureness_report,
 )
+from trainers.reporting.films import EpisodeCamera, EpisodeFilms
 from trainers.reporting.progress import check_progress
 from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import RunSettings, load_run, load_run_document
@@ -157,20 +159,58 @@ def evaluate(
     with closing(evaluation_environment(run, count)) as env, ExitStack() as stack:
         _check_spaces(acting, env)
         evaluator = env.evaluator()
-        physical, pictures, into = None, None, None
+        physical, shown = None, _Shown()
         if check:
             with _asked_for(f"the {evaluator.check_name}"):
                 physical = evaluator.physical_check(window=window)
             stack.enter_context(closing(physical))
         if render is not None:
-            with _asked_for("--render"):
-                pictures = evaluator.pictures()
-            into = EvaluationFolder(Path(render or folder / EVALUATION), pictures.file_names)
+            shown = _Shown.of(env)
+            into = EvaluationFolder(Path(render or folder / EVALUATION), shown.file_names)
         with check_progress(physical, evaluator.check_name, count):
-            report = evaluate_policy(acting, env, count, seed, check=physical, pictures=pictures)
-        if pictures is not None and into is not None:
-            into.write(report, pictures.files())
+            report = evaluate_policy(
+                acting, env, count, seed,
+                check=physical, pictures=shown.pictures, films=shown.films,
+            )  # fmt: skip
+        if render is not None:
+            into.write(report, shown.files())
     return Evaluation(report, report_figures(evaluator))
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What `--render` shows: first actions, whole episodes, or both."""
+
+    pictures: EvaluationReport | None = None
+    films: EpisodeFilms | None = None
+
+    @classmethod
+    def of(cls, env: Environment) -> _Shown:
+        """All that an environment can show.
+
+        Raises:
+            UserError: that is nothing.
+        """
+        if not env.frames_per_second:
+            with _asked_for("--render"):
+                return cls(env.evaluator().pictures())
+        films = EpisodeFilms(env)
+        try:
+            return cls(env.evaluator().pictures(), films)
+        except ValueError:
+            return cls(films=films)
+
+    @property
+    def file_names(self) -> tuple[str, ...]:
+        return tuple(name for part in self._parts for name in part.file_names)
+
+    def files(self) -> Iterator[tuple[str, bytes]]:
+        for part in self._parts:
+            yield from part.files()
+
+    @property
+    def _parts(self) -> list[EvaluationReport | EpisodeFilms]:
+        return [part for part in (self.pictures, self.films) if part is not None]
 
 
 def find_run(
@@ -265,6 +305,8 @@ def evaluate_policy(
     *,
     check: PhysicalCheck | None = None,
     pictures: EvaluationReport | None = None,
+    films: EpisodeFilms | None = None,
+    camera: EpisodeCamera | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
     """Evaluates a policy in environments that serve nothing else: they are reset.
@@ -282,6 +324,8 @@ def evaluate_policy(
             depend on when the ones before them ended.
         check: what the first actions are tried out in.
         pictures: are shown the first actions.
+        films: of whole episodes; the worst are played again for that.
+        camera: films whole episodes, too, where there is no need for the worst.
         stop_requested: asked before every step of the whole episodes.
 
     Returns:
@@ -304,14 +348,17 @@ def evaluate_policy(
         first = _first_action_report(
             policy, env_runner, episodes, first_seed + FIRST_ACTION, check, pictures
         )
-    played = _whole_episodes(
+    play = partial(
+        _whole_episodes,
         policy,
         env_runner,
-        episodes,
-        first_seed + WHOLE_EPISODE,
+        seed=first_seed + WHOLE_EPISODE,
         deterministic=not evaluator.judges_first_action,
     )
+    played = play(episodes, camera=films.first if films is not None else camera)
     whole = _episode_report(evaluator, played)
+    if films is not None:
+        play(films.aim_at_worst(played), camera=films.worst)
     return {"episodes": episodes, "seed": seed, **whole, **first}
 
 
@@ -393,7 +440,13 @@ def _joined(parts: Sequence[Metrics], rows: int) -> Metrics:
 
 
 def _whole_episodes(
-    policy: ActingPolicy, env_runner: EnvRunner, episodes: int, seed: int, *, deterministic: bool
+    policy: ActingPolicy,
+    env_runner: EnvRunner,
+    episodes: int,
+    *,
+    seed: int,
+    deterministic: bool,
+    camera: EpisodeCamera | None = None,
 ) -> EpisodeBatch:
     """Plays until the first `episodes` to begin have ended.
 
@@ -405,17 +458,22 @@ def _whole_episodes(
     parts: list[EpisodeBatch] = []
     finished = 0
     env_runner.reset(seed)
+    first = int(env_runner.running.min())
     state: NDArray[Any] | None = None
     while finished < episodes:
         actions, state = policy.predict(env_runner.observations, state, deterministic)
-        done = env_runner.step(actions).done
+        if camera is not None:
+            camera.before_step(env_runner.running - first)
+        step = env_runner.step(actions)
+        if camera is not None:
+            camera.after_step(actions, step.reward)
         if env_runner.longest_episode >= EPISODE_STEP_LIMIT:
             raise EnvironmentFailure(
                 f"an episode of the evaluation has not ended in {EPISODE_STEP_LIMIT} steps: set a "
                 "limit, such as environment.max_episode_steps=1000 where it is gymnasium's"
             )
         if state is not None:
-            state[done] = 0.0
+            state[step.done] = 0.0
         parts.append(env_runner.pop_finished())
         finished += len(parts[-1])
     return concatenate(parts)[:episodes]

@@ -6,6 +6,14 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+<<<<<<< HEAD
+=======
+import numpy as np
+from numpy.typing import NDArray
+from torch import nn
+
+from envs.evaluation import EvaluationReport, Evaluator
+>>>>>>> bb57553 (Evaluations of grasping log six first actions with goal and command drawn in)
 from trainers.common.errors import UserError, suggestion
 from trainers.common.timers import timed
 from trainers.evaluation import evaluate_policy, evaluation_environment
@@ -13,9 +21,11 @@ from trainers.inference.policy import Policy
 from trainers.networks.network import evaluation_mode
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.figures import evaluation_tag, figure_values
+from trainers.reporting.films import EpisodeCamera
 from trainers.runfile.settings import EvaluationSettings, RunSettings
 from trainers.session import Session
 
+FILM_TAG, DRAWN_TAG = "Evaluation/Episode", "Evaluation/First Actions"
 BEST_BY = ("first_action_success", "success", "reward")
 """Entries of a report that say how good a policy is, the one to be preferred first."""
 
@@ -84,8 +94,12 @@ class HeldOutEvaluation:
         self.log(log)
 
     def log(self, log: RunLog) -> None:
-        """Logs the latest report."""
+        """Logs the latest report, and what can be drawn and filmed of it."""
         log.scalars(_tagged(self.latest), self.latest["step"])
+        if self._drawn.picture is not None:
+            log.image(DRAWN_TAG, self._drawn.picture, self.latest["step"])
+        if self._film is not None:
+            log.video(FILM_TAG, self._film.frames, self._film.fps, self.latest["step"])
 
     @property
     def tags(self) -> tuple[str, ...]:
@@ -122,12 +136,19 @@ class HeldOutEvaluation:
         policy = Policy(
             network, env.single_observation_space, env.single_action_space, settings.seed
         )
+        evaluator = env.evaluator()
+        drawn = DrawnActions(evaluator)
+        camera = EpisodeCamera(env, (0,)) if env.frames_per_second else None
         with timed("evaluation"), evaluation_mode(network):
             report = evaluate_policy(
-                policy, env, settings.episodes, settings.seed, stop_requested=self._stop_requested
-            )
+                policy, env, settings.episodes, settings.seed,
+                pictures=drawn if evaluator.judges_first_action else None,
+                camera=camera, stop_requested=self._stop_requested,
+            )  # fmt: skip
         self.took_s = time.monotonic() - start_s
         self._evaluated_at, self.latest = step, {"step": step, **report}
+        self._drawn = drawn
+        self._film = camera.films[0] if camera is not None else None
 
     def _check_target(self) -> None:
         target = self._settings.stop_when
@@ -139,6 +160,44 @@ class HeldOutEvaluation:
             )
 
 
+<<<<<<< HEAD
+=======
+class DrawnActions(EvaluationReport):
+    """Has the first of an evaluation's first actions drawn.
+
+    Attributes:
+        picture: (H, W, 3); None where there is none.
+    """
+
+    file_names = ()
+
+    def __init__(self, evaluator: Evaluator):
+        self._evaluator = evaluator
+        self.picture: NDArray[np.uint8] | None = None
+
+    def add(self, actions: NDArray[Any], outcomes: Mapping[str, NDArray[np.bool_]]) -> None:
+        """See `EvaluationReport`."""
+        if self.picture is None:
+            self.picture = self._evaluator.drawn(actions)
+
+    def files(self) -> Iterator[tuple[str, bytes]]:
+        """None; see `picture`."""
+        yield from ()
+
+
+@contextmanager
+def _evaluation_mode(network: nn.Module) -> Iterator[None]:
+    """Evaluation mode for a network; afterwards each of its modules is in its own mode again."""
+    training = [module for module in network.modules() if module.training]
+    network.eval()
+    try:
+        yield
+    finally:
+        for module in training:
+            module.training = True
+
+
+>>>>>>> bb57553 (Evaluations of grasping log six first actions with goal and command drawn in)
 def _check_interval(settings: EvaluationSettings, collection_steps: int) -> None:
     if settings.interval < collection_steps:
         raise UserError(

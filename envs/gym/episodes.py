@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import traceback
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import gymnasium
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from curricula.samplers import ParameterValue
 from envs.environment import EnvironmentFailure
 from envs.gym.parameters import AttributeParameters, pick
-from envs.gym.returned import WrongReturn, checked_reset, checked_step
+from envs.gym.returned import WrongReturn, checked_frame, checked_reset, checked_step
 
 IS_SUCCESS = "is_success"
 """Key of an info that says whether the episode is a success, as Stable-Baselines3 reads it."""
@@ -69,6 +69,8 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._last_info: dict[str, Any] = {}
         self._parameters = AttributeParameters(env)
         self._drawn: dict[str, float] = {}
+        self._is_filmed = False
+        self._pictures: list[NDArray[np.uint8]] = []
 
     def known_parameters(self) -> frozenset[str]:
         """Names of the environment's parameters."""
@@ -110,6 +112,8 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         try:
             returned = self.env.step(action)
             observation, reward, terminated, truncated, info = checked_step(self._space, returned)
+            if self._is_filmed:
+                self._pictures.append(checked_frame(self.env.render()))
         except (Exception, SystemExit) as error:
             raise self._failure(error) from error
         ended = terminated or truncated
@@ -137,6 +141,23 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         for action in actions[len(actions) - lengths[self._index] :, self._index].copy():
             observation, *_ = self.step(action)
         return observation
+
+    def film(self, rows: Collection[int]) -> None:
+        """See `Environment.film`; rows are those of all the run's environments.
+
+        Raises:
+            EnvironmentFailure: the environment can't be rendered.
+        """
+        self._is_filmed = self._index in rows
+        try:
+            self._pictures = [checked_frame(self.env.render())] if self._is_filmed else []
+        except (Exception, SystemExit) as error:
+            raise self._failure(error) from error
+
+    def pop_frames(self) -> list[NDArray[np.uint8]]:
+        """Frames (H, W, 3) since the last call."""
+        pictures, self._pictures = self._pictures, []
+        return pictures
 
     def _begin(
         self, drawn: Mapping[str, float], options: dict[str, Any] | None

@@ -54,6 +54,14 @@ def checked_step(
     return observation, reward, bool(terminated), bool(truncated), info
 
 
+def checked_frame(returned: Any) -> NDArray[np.uint8]:
+    """A copy of the picture in color that `render` returned; errors as `checked_reset`'s."""
+    frame = _array(returned)
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+        raise _wrong("what `render` returned", returned, "an array of uint8 (height, width, 3)")
+    return frame.copy()
+
+
 def check_observation(
     space: gymnasium.Space[Any], value: Any, name: str = "the observation"
 ) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 from curricula.samplers import ParameterValue
 from envs.environment import Environment, EnvironmentFailure, ObservationArrays, StepResult
-from envs.evaluation import SUCCESS
+from envs.evaluation import SUCCESS, EvaluationReport, Evaluator
 from envs.gym.action_history import ActionHistory
 from envs.gym.episodes import IS_SUCCESS
 from envs.gym.making import make_vector_env
@@ -30,7 +30,21 @@ ADDED_INFOS = ("final_obs", "_final_obs", "final_info", "_final_info")
 LONGEST_REPLAY_STEPS = 30_000
 """Of an episode that is played again where a run goes on: a game of Atari's still is."""
 
+USUAL_FPS = 30.0
+"""Of environments that don't say."""
+
 _logger = logging.getLogger("ventosa")
+
+
+class GymEvaluator(Evaluator):
+    """Judges episodes by their rewards and successes; they are filmed where they are rendered."""
+
+    def pictures(self) -> EvaluationReport:
+        """None; see `GymEnvironment.film`."""
+        raise ValueError(
+            "the environment renders nothing: write environment.kwargs.render_mode=rgb_array "
+            "behind the policy, and episodes are filmed"
+        )
 
 
 class GymEnvironment(Environment):
@@ -78,6 +92,8 @@ class GymEnvironment(Environment):
         self.single_action_space = self._act.space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
+        if settings.kwargs.get("render_mode") == "rgb_array":
+            self.frames_per_second = float(self._vector.metadata.get("render_fps", USUAL_FPS))
         self._lengths = np.zeros(self.num_envs, np.int64)
         # As many steps as the longest episode has that can be played again, at least.
         self._history = ActionHistory(self.action_space.shape or (), self.action_space.dtype)
@@ -210,6 +226,18 @@ class GymEnvironment(Environment):
             raise ValueError(f"parameters {unknown}, which the environment does not have")
         if any(values.shape != (self.num_envs,) for values in parameters.values()):
             raise ValueError(f"not one value for each of {self.num_envs} environments: parameters")
+
+    def evaluator(self) -> Evaluator:
+        """See `Environment.evaluator`."""
+        return GymEvaluator()
+
+    def film(self, rows: Collection[int]) -> None:
+        """See `Environment.film`."""
+        self._call("film", tuple(rows))
+
+    def pop_frames(self) -> dict[int, list[NDArray[np.uint8]]]:
+        """See `Environment.pop_frames`."""
+        return {row: frames for row, frames in enumerate(self._call("pop_frames")) if frames}
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the environments."""

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium
+import numpy as np
 import pytest
+from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from envs.evaluation import Evaluator
 from trainers.common.logger import LoggedRun
+from trainers.evaluate import main as evaluate
 from trainers.loggers.mlflow import MLflow
 from trainers.reporting import event_log
 
@@ -116,3 +122,67 @@ def test_the_page_hparams_has_the_runs_settings_and_its_figures(
     about = HParamsPluginData.FromString(content["_hparams_/experiment"]).experiment
     compared = {info.name.tag for info in about.metric_infos}
     assert {REWARD, "Evaluation/Reward"} <= compared & set(events.Tags()["scalars"])
+
+
+class Blinking(gymnasium.Env[Any, Any]):
+    """Episodes of four steps, and a picture that changes with each."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+    observation_space = gymnasium.spaces.Box(0.0, 1.0, (1,))
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, render_mode: str | None = None):
+        self.render_mode, self._step = render_mode, 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self._step = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        self._step += 1
+        return np.zeros(1, np.float32), 1.0, self._step == 4, False, {}
+
+    def render(self) -> Any:
+        return np.full((30, 40, 3), 50 * self._step, np.uint8)
+
+
+def test_evaluations_of_what_is_rendered_have_a_video_and_films(
+    learn: Learn, write_run: WriteRun, monkeypatch: pytest.MonkeyPatch, capfd: Any
+) -> None:
+    spec = gymnasium.envs.registration.EnvSpec("Blinking-v0", Blinking)
+    monkeypatch.setitem(gymnasium.registry, "Blinking-v0", spec)
+    environment = {"type": "gymnasium", "id": "Blinking-v0", "num_envs": 2}
+    rendered = {**environment, "kwargs": {"render_mode": "rgb_array"}}
+    done = learn(write_run(rendered, evaluation={"interval": 32, "episodes": 4}))
+    events = EventAccumulator(str(done.results / "toy"))
+    events.Reload()
+    videos = events.Images("Evaluation/Episode")
+    assert [video.step for video in videos] == [0, 32, 64]
+    image = Image.open(io.BytesIO(videos[0].encoded_image_string))
+    assert image.n_frames == 5  # type: ignore[attr-defined]
+
+    run = str(done.results / "toy")
+    assert evaluate([run, "--render", "--episodes", "4"]) == 0
+    files = {path.name for path in (done.results / "toy/evaluation").iterdir()}
+    assert files == {f"{which}-{n}.gif" for which in ("first", "worst") for n in (1, 2)} | {
+        "evaluation.json"
+    }
+    capfd.readouterr()
+    assert evaluate([run, "environment.kwargs.render_mode=null", "--render"]) == 2
+    assert "environment.kwargs.render_mode=rgb_array behind the policy" in capfd.readouterr().err
+
+
+def test_first_actions_are_drawn_at_each_evaluation(
+    learn: Learn, write_run: WriteRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def drawn(self: Evaluator, actions: Any) -> Any:
+        return np.full((4, len(actions), 3), 9, np.uint8)
+
+    monkeypatch.setattr(Evaluator, "drawn", drawn)
+    done = learn(write_run("darts", evaluation={"interval": 32, "episodes": 6}))
+    events = EventAccumulator(str(done.results / "toy"))
+    events.Reload()
+    images = events.Images("Evaluation/First Actions")
+    # Of the first of two batches of four environments.
+    assert [(image.step, image.width) for image in images] == [(0, 4), (32, 4), (64, 4)]

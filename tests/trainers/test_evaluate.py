@@ -104,6 +104,14 @@ def test_counts_and_seeds_are_whole_numbers_within_limits(
     assert f"not '{value}'" in said
 
 
+def test_a_key_is_not_taken_for_the_folder_of_pictures(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["policies/grasp", "--render", "environment.num_envs=2"])
+    assert stop.value.code == 2
+    said = "environment.num_envs=2 is taken for its DIR: write it before --render"
+    assert said in capsys.readouterr().err
+
+
 def test_nothing_but_the_policy_is_required(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main([])

@@ -157,6 +157,11 @@ class EnvRunner:
             self._stop_requested = asked
 
     @property
+    def running(self) -> NDArray[np.int64]:
+        """Numbers (N,) of the running episodes, in the order in which they began."""
+        return self._number
+
+    @property
     def longest_episode(self) -> int:
         """Steps of the longest of the running episodes."""
         return int(self._length.max())

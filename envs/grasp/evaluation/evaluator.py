@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from encoders.spaces import MM_PER_M
+from encoders.spaces import MM_PER_M, DepthImage, RgbImage
 from envs.evaluation import (
     EvaluationOption,
     Evaluator,
@@ -18,9 +19,15 @@ from envs.evaluation import (
     error,
     rate,
 )
+<<<<<<< HEAD
+=======
+from envs.grasp.evaluation.overlay import sheet
+from envs.grasp.evaluation.pick import PickCheck, Picker
+>>>>>>> bb57553 (Evaluations of grasping log six first actions with goal and command drawn in)
 from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.evaluation.report import GraspReport
 from envs.grasp.evaluation.unanswerable import unanswerable
+from envs.grasp.observations import observation_space
 from envs.grasp.robot.arm import Arm
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.installation import require_pybullet
@@ -84,6 +91,16 @@ class GraspEvaluator(Evaluator):
     def pictures(self) -> GraspReport:
         """Scenes, errors and a film; see `envs.grasp.evaluation.report`."""
         return GraspReport(self._settings, self._arm, self._pose_commands)
+
+    def drawn(self, actions: NDArray[Any]) -> NDArray[np.uint8] | None:
+        """See `Evaluator.drawn`; None where there are clouds of points alone."""
+        spaces = observation_space(self._settings).spaces
+        images = {n: s for n, s in spaces.items() if isinstance(s, DepthImage | RgbImage)}
+        if not images:
+            return None
+        camera = min(images, key=lambda name: isinstance(images[name], RgbImage))  # depth, if any
+        commands = self._pose_commands(actions)
+        return sheet(commands, camera, images[camera], self._arm.robot.cup_radius_m)
 
     def unanswerable(self, count: int, seed: int) -> Iterator[Unanswerable]:
         """See `envs.grasp.evaluation.unanswerable`."""

@@ -15,16 +15,18 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from encoders.spaces import NOTHING_SEEN
+<<<<<<< HEAD
 from envs.grasp.evaluation.outcome import Outcome
+=======
+from envs.grasp.evaluation.overlay import cup_lines, goal_pose
+from envs.grasp.evaluation.pick import Outcome
+>>>>>>> bb57553 (Evaluations of grasping log six first actions with goal and command drawn in)
 from envs.grasp.evaluation.pose_errors import PoseErrors, Sample, outcome_label
-from envs.grasp.scene.sampler import heading
 from envs.grasp.sensors.camera import CameraPoses, project
 
 Floats = NDArray[np.float64]
 
 COLUMNS = 6
-STEM_M = 0.08
-RIM_POINTS = 48
 TRUE_COLOR, COMMAND_COLOR = "white", "magenta"
 NOTHING_SEEN_COLOR = "gray"
 GOOD_COLOR, BAD_COLOR = "tab:green", "tab:red"
@@ -57,15 +59,12 @@ def contact_sheet(samples: Sequence[Sample], cup_radius_m: float) -> bytes:
         axes.axis("off")
     for axes, sample in zip(grid.flat, samples, strict=False):
         _show(axes, sample.image)
-        true_yaw_rad = float(sample.scene.target_yaw_rad[0])
-        middle_m = sample.errors.region.middle_m[0]
-        goal_m = sample.scene.target_m[0] + _in_world(middle_m, true_yaw_rad)
+        goal_m, goal_yaw_rad = goal_pose(sample.scene, sample.errors.region)
         for tooltip_m, yaw_rad, color in (
-            (goal_m, true_yaw_rad, TRUE_COLOR),
+            (goal_m, goal_yaw_rad, TRUE_COLOR),
             (sample.tooltip_m, sample.yaw_rad, COMMAND_COLOR),
         ):
-            rim, stem = _cup(tooltip_m, yaw_rad, cup_radius_m)
-            _draw_lines(axes, sample.view, (rim, stem), color)
+            _draw_lines(axes, sample.view, cup_lines(tooltip_m, yaw_rad, cup_radius_m), color)
         good = sample.errors.outcome[0] in ("", "success")
         axes.set_title(sample.caption, fontsize=8, color="black" if good else BAD_COLOR)
     figure.suptitle(
@@ -159,27 +158,12 @@ def _show(axes: Axes, image: NDArray[Any]) -> None:
     axes.set(xlim=(0, width), ylim=(height, 0))
 
 
-def _cup(tooltip_m: Floats, yaw_rad: float, radius_m: float) -> tuple[Floats, Floats]:
-    """The cup's rim (k, 3), and its axis (2, 3) back towards the robot."""
-    angle = np.linspace(0.0, 2.0 * math.pi, RIM_POINTS)[:, None]
-    ahead, up = heading(np.array(yaw_rad)), np.array([0.0, 0.0, 1.0])
-    rim = tooltip_m + radius_m * (np.cos(angle) * np.cross(up, ahead) + np.sin(angle) * up)
-    return rim, np.stack([tooltip_m, tooltip_m - STEM_M * ahead])
-
-
 def _draw_lines(axes: Axes, view: CameraPoses, lines: Sequence[Floats], color: str) -> None:
     """Draws lines (k, 3) of the world into the image of a view."""
     for points in lines:
         u, v, _ = project(view, points[None])[0].T
         axes.plot(u, v, color="black", linewidth=2.6)
         axes.plot(u, v, color=color, linewidth=1.6)
-
-
-def _in_world(offset_m: Floats, yaw_rad: float) -> Floats:
-    """An offset (3,) of the block frame, lateral, vertical and gap, in the world frame."""
-    sine, cosine = math.sin(yaw_rad), math.cos(yaw_rad)
-    lateral, vertical, gap = offset_m
-    return np.array([sine * lateral - cosine * gap, -cosine * lateral - sine * gap, vertical])
 
 
 def _png(figure: Figure) -> bytes:

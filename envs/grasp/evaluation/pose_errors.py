@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+<<<<<<< HEAD
 from envs.grasp.evaluation.outcome import Outcome
+=======
+from envs.grasp.evaluation.pick import Outcome
+from envs.grasp.evaluation.pose_commands import PoseCommands
+>>>>>>> bb57553 (Evaluations of grasping log six first actions with goal and command drawn in)
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses
-from envs.grasp.task import GoalRegion
+from envs.grasp.task import GoalRegion, block_offset, yaw_error
 
 Floats = NDArray[np.float64]
 
@@ -58,6 +64,29 @@ class PoseErrors:
         """(n,) to the goal region's middle."""
         return np.asarray(np.linalg.norm(self.error_m, axis=1))
 
+    @property
+    def caption(self) -> str:
+        """Error of the first command, and what came of it."""
+        error = f"{self.distance_m[0] * 1000:.1f} mm, {abs(self.yaw_error_deg[0]):.1f} deg"
+        return f"{error}   {outcome_label(self.outcome[0])}".rstrip()
+
+
+def errors_of(commands: PoseCommands, outcomes: Mapping[str, NDArray[np.bool_]]) -> PoseErrors:
+    """Errors of n commands, and what a physical check said of them, if it did, by name (n,)."""
+    target_m, target_yaw_rad = commands.scenes.target_m, commands.scenes.target_yaw_rad
+    offset_m = block_offset(commands.tooltip_m, target_m, target_yaw_rad)
+    names = np.full(len(commands), "", dtype="<U32")
+    for name, rows in outcomes.items():
+        names[rows] = name
+    return PoseErrors(
+        target_m=target_m,
+        target_yaw_deg=np.degrees(target_yaw_rad),
+        region=commands.region,
+        error_m=offset_m - commands.region.middle_m,
+        yaw_error_deg=np.degrees(yaw_error(commands.yaw_rad, target_yaw_rad)),
+        outcome=names,
+    )
+
 
 @dataclass(frozen=True)
 class Sample:
@@ -73,9 +102,7 @@ class Sample:
     @property
     def caption(self) -> str:
         """Error of the command, and what came of it."""
-        errors = self.errors
-        error = f"{errors.distance_m[0] * 1000:.1f} mm, {abs(errors.yaw_error_deg[0]):.1f} deg"
-        return f"{error}   {outcome_label(errors.outcome[0])}".rstrip()
+        return self.errors.caption
 
 
 def outcome_label(outcome: str) -> str:

@@ -11,12 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.grasp.evaluation.pose_commands import PoseCommands
-from envs.grasp.evaluation.pose_errors import PoseErrors, Sample
+from envs.grasp.evaluation.pose_errors import PoseErrors, Sample, errors_of
 from envs.grasp.robot.arm import Arm
 from envs.grasp.sensors.clouds import cloud_camera
 from envs.grasp.settings import GraspSettings
+<<<<<<< HEAD
 from envs.grasp.simulators.installation import has_pybullet
 from envs.grasp.task import GoalRegion, block_offset, yaw_error
+=======
+from envs.grasp.task import GoalRegion
+>>>>>>> bb57553 (Evaluations of grasping log six first actions with goal and command drawn in)
 
 Floats = NDArray[np.float64]
 
@@ -70,7 +74,7 @@ class GraspReport:
     def add(self, actions: NDArray[Any], outcomes: Mapping[str, NDArray[np.bool_]]) -> None:
         """See `EvaluationReport`."""
         commands = self._pose_commands(actions)
-        errors = _errors_of(commands, outcomes)
+        errors = errors_of(commands, outcomes)
         self._errors.append(errors)
         self._picked = bool(outcomes)
         self._samples += [
@@ -112,22 +116,6 @@ class GraspReport:
             yaw_rad=float(commands.yaw_rad[row][0]),
             errors=errors[row],
         )
-
-
-def _errors_of(commands: PoseCommands, outcomes: Mapping[str, NDArray[np.bool_]]) -> PoseErrors:
-    target_m, target_yaw_rad = commands.scenes.target_m, commands.scenes.target_yaw_rad
-    offset_m = block_offset(commands.tooltip_m, target_m, target_yaw_rad)
-    names = np.full(len(commands), "", dtype="<U32")
-    for name, rows in outcomes.items():
-        names[rows] = name
-    return PoseErrors(
-        target_m=target_m,
-        target_yaw_deg=np.degrees(target_yaw_rad),
-        region=commands.region,
-        error_m=offset_m - commands.region.middle_m,
-        yaw_error_deg=np.degrees(yaw_error(commands.yaw_rad, target_yaw_rad)),
-        outcome=names,
-    )
 
 
 def _concatenate(parts: list[PoseErrors]) -> PoseErrors:

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from envs.drawing import TEXT_HEIGHT_PX
 from envs.grasp.env import make_vector_env
+from envs.grasp.evaluation import overlay
 from envs.grasp.evaluation import report as report_module
 from envs.grasp.evaluation.film import film
 from envs.grasp.evaluation.plots import (
@@ -203,3 +205,35 @@ def test_without_matplotlib_the_message_says_what_to_install(
     )
     with pytest.raises(ValueError, match=r"matplotlib.*\[render\]"):
         env.evaluator().pictures()
+
+
+def test_first_actions_are_drawn_where_the_camera_would_see_them(env: GraspVectorEnv) -> None:
+    picture = env.evaluator().drawn(actions(env, ahead=-0.015, up=0.0, yaw_deg=0.0))
+    assert picture is not None
+    tile_px = overlay.TILE_PX
+    assert picture.shape == (2 * (tile_px + TEXT_HEIGHT_PX), 3 * tile_px, 3)
+    # A perfect command covers the goal.
+    assert not (picture[:tile_px] == overlay.GOAL_COLOR).all(axis=2).any()
+    apart = env.evaluator().drawn(actions(env, ahead=-0.1, up=0.0, yaw_deg=0.0))
+    assert apart is not None
+    depth, scenes = next(iter(env._running().views.values())), env.scenes
+    middle_m = scenes.target_m[1] - 0.015 * heading(scenes.target_yaw_rad[1])
+    u, v, _ = project(depth[1:2], middle_m[None, None])[0, 0]
+    rim = overlay.cup_lines(middle_m, float(scenes.target_yaw_rad[1]), ARM.robot.cup_radius_m)[0]
+    scale = tile_px / depth.camera.width
+    tile = apart[:tile_px, tile_px : 2 * tile_px]
+    white = np.argwhere((tile == overlay.GOAL_COLOR).all(axis=2))[:, ::-1] / scale
+    seen = project(depth[1:2], rim[None])[0, :, :2]
+    far = np.linalg.norm(white - [u, v], axis=1)
+    # Its axis is as long as in the world; its rim is around the middle.
+    assert len(white) > 20
+    assert far.min() <= np.linalg.norm(seen - [u, v], axis=1).max() + 1.0
+
+
+def test_clouds_alone_are_not_drawn() -> None:
+    made = make_vector_env(2, simulator="fast", cameras={"eye": Camera(type="points")})
+    try:
+        made.reset(seed=0)
+        assert made.evaluator().drawn(np.zeros((2, 4))) is None
+    finally:
+        made.close()
