@@ -6,14 +6,10 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-<<<<<<< HEAD
-=======
 import numpy as np
 from numpy.typing import NDArray
-from torch import nn
 
 from envs.evaluation import EvaluationReport, Evaluator
->>>>>>> bb57553 (Evaluations of grasping log six first actions with goal and command drawn in)
 from trainers.common.errors import UserError, suggestion
 from trainers.common.timers import timed
 from trainers.evaluation import evaluate_policy, evaluation_environment
@@ -160,8 +156,6 @@ class HeldOutEvaluation:
             )
 
 
-<<<<<<< HEAD
-=======
 class DrawnActions(EvaluationReport):
     """Has the first of an evaluation's first actions drawn.
 
@@ -185,19 +179,6 @@ class DrawnActions(EvaluationReport):
         yield from ()
 
 
-@contextmanager
-def _evaluation_mode(network: nn.Module) -> Iterator[None]:
-    """Evaluation mode for a network; afterwards each of its modules is in its own mode again."""
-    training = [module for module in network.modules() if module.training]
-    network.eval()
-    try:
-        yield
-    finally:
-        for module in training:
-            module.training = True
-
-
->>>>>>> bb57553 (Evaluations of grasping log six first actions with goal and command drawn in)
 def _check_interval(settings: EvaluationSettings, collection_steps: int) -> None:
     if settings.interval < collection_steps:
         raise UserError(

@@ -19,11 +19,7 @@ from envs.evaluation import (
     error,
     rate,
 )
-<<<<<<< HEAD
-=======
 from envs.grasp.evaluation.overlay import sheet
-from envs.grasp.evaluation.pick import PickCheck, Picker
->>>>>>> bb57553 (Evaluations of grasping log six first actions with goal and command drawn in)
 from envs.grasp.evaluation.pose_commands import PoseCommands
 from envs.grasp.evaluation.report import GraspReport
 from envs.grasp.evaluation.unanswerable import unanswerable

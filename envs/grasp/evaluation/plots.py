@@ -15,12 +15,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from encoders.spaces import NOTHING_SEEN
-<<<<<<< HEAD
 from envs.grasp.evaluation.outcome import Outcome
-=======
 from envs.grasp.evaluation.overlay import cup_lines, goal_pose
-from envs.grasp.evaluation.pick import Outcome
->>>>>>> bb57553 (Evaluations of grasping log six first actions with goal and command drawn in)
 from envs.grasp.evaluation.pose_errors import PoseErrors, Sample, outcome_label
 from envs.grasp.sensors.camera import CameraPoses, project
 

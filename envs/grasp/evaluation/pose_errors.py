@@ -9,12 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-<<<<<<< HEAD
 from envs.grasp.evaluation.outcome import Outcome
-=======
-from envs.grasp.evaluation.pick import Outcome
 from envs.grasp.evaluation.pose_commands import PoseCommands
->>>>>>> bb57553 (Evaluations of grasping log six first actions with goal and command drawn in)
 from envs.grasp.scene.sampler import Scenes
 from envs.grasp.sensors.camera import CameraPoses
 from envs.grasp.task import GoalRegion, block_offset, yaw_error

@@ -15,12 +15,8 @@ from envs.grasp.evaluation.pose_errors import PoseErrors, Sample, errors_of
 from envs.grasp.robot.arm import Arm
 from envs.grasp.sensors.clouds import cloud_camera
 from envs.grasp.settings import GraspSettings
-<<<<<<< HEAD
 from envs.grasp.simulators.installation import has_pybullet
-from envs.grasp.task import GoalRegion, block_offset, yaw_error
-=======
 from envs.grasp.task import GoalRegion
->>>>>>> bb57553 (Evaluations of grasping log six first actions with goal and command drawn in)
 
 Floats = NDArray[np.float64]
 
