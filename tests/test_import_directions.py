@@ -17,15 +17,15 @@ ROOMS = {
     "trainers.networks": {"trainers.common"},
     "trainers.experience": {"trainers.networks", "trainers.common"},
     "trainers.algorithms": {"trainers.experience", "trainers.networks", "trainers.common"},
-    "trainers.runfile": {"trainers.common"},
-    "trainers.saving": {"trainers.runfile", "trainers.common"},
+    "trainers.loggers": {"trainers.common"},
+    "trainers.runfile": {"trainers.loggers", "trainers.common"},
+    "trainers.saving": {"trainers.runfile", "trainers.loggers", "trainers.common"},
     "trainers.inference": {
         "trainers.networks",
         "trainers.saving",
         "trainers.runfile",
         "trainers.common",
     },
-    "trainers.loggers": {"trainers.common"},
     "trainers.reporting": {
         "trainers.experience",
         "trainers.networks",

@@ -68,7 +68,7 @@ def ventosa_trainers() -> dict[str, type]:  # type: ignore[empty-body]
 
 @hookspec
 def ventosa_loggers() -> dict[str, type]:  # type: ignore[empty-body]
-    """Offer loggers: name -> `trainers.common.logger.Logger` subclass.
+    """Offer loggers: name -> `trainers.loggers.base.Logger` subclass.
 
     It is built as `cls(settings, run)` when a run begins, and is given what the run reports. What
     it raises does not end the run.

@@ -16,8 +16,8 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from envs.evaluation import Evaluator
-from trainers.common.logger import LoggedRun
 from trainers.evaluate import main as evaluate
+from trainers.loggers.base import LoggedRun
 from trainers.loggers.mlflow import MLflow
 from trainers.reporting import event_log
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from trainers.common.command import require_extra
-from trainers.common.logger import LoggedRun, Logger, flat
 from trainers.loggers.animation import animated_gif
+from trainers.loggers.base import LoggedRun, Logger, flat
 
 PATIENCE = {"MLFLOW_HTTP_REQUEST_TIMEOUT": "10", "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2"}
 """With a server that does not answer, unless the environment says otherwise; MLflow's own waits for

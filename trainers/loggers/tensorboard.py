@@ -14,8 +14,8 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
-from trainers.common.logger import LoggedRun, Logger, flat
 from trainers.loggers.animation import animated_gif
+from trainers.loggers.base import LoggedRun, Logger, flat
 from trainers.loggers.event_files import cut_after
 
 IN_COLOR = 3

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from trainers.common.command import require_extra
-from trainers.common.logger import LoggedRun, Logger
 from trainers.loggers.animation import animated_gif
+from trainers.loggers.base import LoggedRun, Logger
 
 TIMEOUT_S = 15.0
 """For the service to answer when a run begins."""

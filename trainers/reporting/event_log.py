@@ -16,7 +16,7 @@ import numpy as np
 
 from trainers.common.errors import first_lines
 from trainers.common.files import naming, write_atomically
-from trainers.common.logger import LoggedRun, Logger
+from trainers.loggers.base import LoggedRun, Logger
 from trainers.loggers.tensorboard import TensorBoard
 
 _logger = logging.getLogger("ventosa")

@@ -21,9 +21,9 @@ from torch import nn
 from envs.environment import Environment
 from trainers import hookspecs
 from trainers.common.errors import UserError, suggestion
-from trainers.common.logger import Logger
 from trainers.common.origin import Origin, origin_of
 from trainers.common.trainer_settings import TrainerSettings
+from trainers.loggers.base import Logger
 
 BUILT_IN = "built-in"
 BUILT_IN_PLUGINS = (
@@ -257,7 +257,7 @@ def trainer_breach(cls: type) -> str | None:
 def logger_breach(cls: type) -> str | None:
     """Say how a logger breaks its contract, or None."""
     fits = issubclass(cls, Logger)
-    return None if fits else f"{cls.__name__} is no trainers.common.logger.Logger"
+    return None if fits else f"{cls.__name__} is no trainers.loggers.base.Logger"
 
 
 def missing_method(cls: type, names: Iterable[str]) -> str | None:

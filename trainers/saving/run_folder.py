@@ -10,7 +10,7 @@ from pathlib import Path
 
 from trainers.common.errors import UserError
 from trainers.common.files import write_atomically
-from trainers.common.logger import IDENTIFIERS
+from trainers.loggers.base import IDENTIFIERS
 from trainers.saving import checkpoint, evaluation_folder
 from trainers.saving.checkpoint import MANIFEST, Checkpoints, Loaded
 from trainers.saving.evaluation_folder import EVALUATION

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from trainers.common.errors import UserError
-from trainers.common.logger import LoggedRun, Logger
+from trainers.loggers.base import LoggedRun, Logger
 from trainers.loggers.mlflow import MLflow
 from trainers.loggers.wandb import WeightsAndBiases
 

@@ -11,8 +11,8 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
-from trainers.common.logger import LoggedRun, flat
 from trainers.loggers.animation import animated_gif
+from trainers.loggers.base import LoggedRun, flat
 from trainers.loggers.tensorboard import TensorBoard
 
 FRAMES = np.zeros((3, 40, 60, 3), np.uint8)

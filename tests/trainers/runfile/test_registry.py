@@ -15,9 +15,9 @@ from torch import nn
 from envs.environment import Environment
 from trainers import hookspecs
 from trainers import plugins as command
-from trainers.common.logger import Logger
 from trainers.common.trainer_settings import TrainerSettings
 from trainers.hookspecs import hookimpl
+from trainers.loggers.base import Logger
 from trainers.runfile import registry as plugins
 from trainers.runfile.registry import (
     Origin,
@@ -224,7 +224,7 @@ def call(self: Any) -> None: ...
         (
             "loggers",
             component("L", Settings=Empty),
-            "L is no trainers.common.logger.Logger",
+            "L is no trainers.loggers.base.Logger",
         ),
     ],
 )

@@ -17,9 +17,9 @@ from torch import nn
 
 from curricula.samplers import UniformSampler
 from envs.environment import Environment
-from trainers.common.logger import Logger
 from trainers.common.trainer_settings import TrainerSettings
 from trainers.hookspecs import hookimpl
+from trainers.loggers.base import Logger
 from trainers.loggers.tensorboard import TensorBoard
 from trainers.runfile.registry import Registries, load_registries, plugin_manager
 from trainers.runfile.settings import RunSettings, SettingsError, dump_yaml, load_run, resolved
