@@ -15,8 +15,14 @@ LEAVES = {"trainers.hookspecs", "trainers.common.cores"}
 ROOMS = {
     "trainers.common": set(),
     "trainers.networks": {"trainers.common"},
-    "trainers.experience": {"trainers.networks", "trainers.common"},
-    "trainers.algorithms": {"trainers.experience", "trainers.networks", "trainers.common"},
+    "trainers.distributed": {"trainers.common"},
+    "trainers.experience": {"trainers.distributed", "trainers.networks", "trainers.common"},
+    "trainers.algorithms": {
+        "trainers.distributed",
+        "trainers.experience",
+        "trainers.networks",
+        "trainers.common",
+    },
     "trainers.loggers": {"trainers.common"},
     "trainers.runfile": {"trainers.loggers", "trainers.common"},
     "trainers.saving": {"trainers.runfile", "trainers.loggers", "trainers.common"},

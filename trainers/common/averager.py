@@ -25,6 +25,12 @@ class Averager:
             self._sums[name] = self._sums.get(name, 0.0) + float(value) * count
             self._counts[name] = self._counts.get(name, 0) + count
 
+    def add_sums(self, state: Mapping[str, Any]) -> None:
+        """Add all that another one was given, from its state."""
+        for name, total in state["sums"].items():
+            self._sums[name] = self._sums.get(name, 0.0) + total
+            self._counts[name] = self._counts.get(name, 0) + state["counts"][name]
+
     def means(self) -> dict[str, float]:
         """The mean of each name that got a value."""
         return {name: total / self._counts[name] for name, total in self._sums.items()}
