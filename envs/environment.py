@@ -55,6 +55,9 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
             of the class or of the instance.
         privileged: names of observations that only a critic may see: a policy does not, unless the
             run file says so. They may be of the class or of the instance.
+        state_axes: which axis of the state's arrays has an entry for each environment, by the names
+            in `state_dict`; all else in it is of them all. Declared by those that know
+            `number_from`.
         evaluation_episodes: how many an evaluation plays unless it is told otherwise.
         evaluation_options: what `trainers.evaluate` offers for it, next to its own options.
         tags: what each of its episode metrics says, by TensorBoard tag, for the reference.
@@ -67,6 +70,7 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
     pays_by_itself: ClassVar[bool] = True
     parameter_names: frozenset[str] = frozenset()
     privileged: frozenset[str] = frozenset()
+    state_axes: ClassVar[Mapping[str, Any]] = {}
     evaluation_episodes: ClassVar[int] = 100
     evaluation_options: ClassVar[tuple[EvaluationOption, ...]] = ()
     tags: ClassVar[Mapping[str, str]] = {}
@@ -105,6 +109,18 @@ class Environment(VectorEnv[ObservationArrays, NDArray[Any], NDArray[Any]], ABC)
         declared that is imported whatever the settings say.
         """
         return ()
+
+    def number_from(self, first: int) -> None:
+        """Says that the environments are those with the numbers `first` on of a run's.
+
+        A run in several processes gives each its share. What one of its environments draws may then
+        depend on the seed, its number and what it was through, and not on those beside it. Called
+        before the first reset.
+
+        Raises:
+            NotImplementedError: they can't be divided.
+        """
+        raise NotImplementedError
 
     def set_parameters(self, parameters: Mapping[str, ParameterValue]) -> None:
         """Sets environment parameters; they hold from each environment's next reset on."""

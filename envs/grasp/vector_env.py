@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import gymnasium
 import numpy as np
@@ -43,6 +43,7 @@ from envs.grasp.scene.sampler import Scenes, SceneSampler
 from envs.grasp.sensors.camera import CameraPoses, overviews
 from envs.grasp.settings import GraspSettings
 from envs.grasp.simulators.factory import make_simulator
+from envs.grasp.streams import EnvironmentStreams
 from envs.grasp.task import EpisodeProgress, GoalRegion, Motion, advance, judge
 from envs.memory import shortage, space_bytes
 from rewards.grasp.transition import GraspTransition
@@ -68,6 +69,9 @@ class GraspVectorEnv(Environment):
 
     Settings = GraspSettings
     snapshot: ClassVar[type[GraspTransition]] = GraspTransition
+    state_axes: ClassVar[Mapping[str, Any]] = dict.fromkeys(
+        ("streams", "scenes", "region", "tools", "progress", "views", "images"), 0
+    )
     pays_by_itself: ClassVar[bool] = False
     parameter_names = frozenset({*GOAL_PARAMETERS, *SENSOR_PARAMETERS, YAW_LIMIT})
     evaluation_episodes: ClassVar[int] = 1000
@@ -115,7 +119,9 @@ class GraspVectorEnv(Environment):
         self._sampler = SceneSampler(settings)
         self._everyone = np.arange(self.num_envs)
         self._episodes: RunningEpisodes | None = None
-        self._rng = np.random.default_rng(seed)
+        self._seed, self._rng = seed, np.random.default_rng(seed)
+        self._first = 0
+        self._streams: EnvironmentStreams | None = None  # in the place of the generator
         self._simulator = make_simulator(
             settings, self._arm.robot, self.num_envs, render_mode == "human"
         )
@@ -127,7 +133,9 @@ class GraspVectorEnv(Environment):
     ) -> tuple[ObservationArrays, dict[str, Any]]:
         """Begins new episodes, in all environments or where `options["reset_mask"]` (N,) is set."""
         if seed is not None:
-            self._rng = np.random.default_rng(seed)
+            self._seed, self._rng = seed, np.random.default_rng(seed)
+            if self._streams is not None:
+                self.number_from(self._first)
         mask = (options or {}).get("reset_mask")
         if mask is None or self._episodes is None:
             mask = np.ones(self.num_envs, bool)
@@ -190,6 +198,10 @@ class GraspVectorEnv(Environment):
 
     # -- training's interface --------------------------------------------------------------------
 
+    def number_from(self, first: int) -> None:
+        """See `Environment.number_from`; each has a stream of random numbers from then on."""
+        self._first, self._streams = first, EnvironmentStreams(self._seed, first, self.num_envs)
+
     def set_parameters(self, parameters: Mapping[str, ParameterValue]) -> None:
         """See `Environment.set_parameters`.
 
@@ -204,7 +216,12 @@ class GraspVectorEnv(Environment):
 
     def state_dict(self) -> dict[str, Any]:
         """See `Environment.state_dict`."""
-        return {"rng": self._rng.bit_generator.state, **self._running().state_dict()}
+        streams = None if self._streams is None else self._streams.state.copy()
+        return {
+            "rng": self._rng.bit_generator.state,
+            "streams": streams,
+            **self._running().state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> ObservationArrays:
         """See `Environment.load_state_dict`.
@@ -216,6 +233,7 @@ class GraspVectorEnv(Environment):
         self._arm.check(episodes.tools)
         self._sampler.check(episodes.scenes)
         self._rng.bit_generator.state = state["rng"]
+        self._streams = EnvironmentStreams.of(state.get("streams"))
         self._episodes = episodes
         self._simulator.load(self._everyone, episodes.scenes, episodes.tools.joints_rad)
         return self._observations()
@@ -281,16 +299,16 @@ class GraspVectorEnv(Environment):
 
     def _begin(self, indices: NDArray[np.int64]) -> None:
         """Begins new episodes in some environments."""
-        n = len(indices)
+        n, rng = len(indices), self._draws(indices)
         given = {
-            name: self._parameter_ranges[name].clip(draw(value, self._rng, n))
+            name: self._parameter_ranges[name].clip(draw(value, rng, n))
             for name, value in self._parameters.items()
         }
         limits = {name: given[name] for name in GOAL_PARAMETERS if name in given}
         sensor = {name: given[name] for name in SENSOR_PARAMETERS if name in given}
         whole_yaw = np.full(n, self._parameter_ranges[YAW_LIMIT].high)
         yaw_limit_rad = np.radians(given.get(YAW_LIMIT, whole_yaw))
-        scenes, views = self._sampler.sample(self._rng, yaw_limit_rad)
+        scenes, views = self._sampler.sample(rng, yaw_limit_rad)
         views = {name: view.with_arrays(sensor) for name, view in views.items()}
         tools = self._arm.home(n)
         self._simulator.load(indices, scenes, tools.joints_rad)
@@ -309,8 +327,15 @@ class GraspVectorEnv(Environment):
         self, indices: NDArray[np.int64], views: Mapping[str, CameraPoses]
     ) -> dict[str, NDArray[Any]]:
         """What each camera observes now in some worlds, by its name."""
-        images = take_images(self._simulator, indices, views, self._image_spaces, self._rng)
-        return observed(images, views, self._rng)
+        rng = self._draws(indices)
+        images = take_images(self._simulator, indices, views, self._image_spaces, rng)
+        return observed(images, views, rng)
+
+    def _draws(self, indices: NDArray[np.int64]) -> np.random.Generator:
+        """The source of randomness for some environments."""
+        if self._streams is None:
+            return self._rng
+        return cast(np.random.Generator, self._streams.rows(indices))
 
     def _observations(self) -> ObservationArrays:
         episodes = self._running()

@@ -48,7 +48,7 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         env: the environment.
         name: for messages.
         run_seed: of the run.
-        index: which of the run's environments it is, from 0.
+        index: which of the environments beside it it is, from 0.
         with_infos: pass on the infos of steps. Otherwise they are empty, but for an episode's
             success at its end: to gather those of many environments takes longer than many a step.
     """
@@ -65,6 +65,7 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         self._name, self._space = name, env.observation_space
         self._run_seed, self._index, self._with_infos = run_seed, index, with_infos
+        self._number = index
         self._begun = self._steps = 0  # episodes, and steps of the last of them
         self._last_info: dict[str, Any] = {}
         self._parameters = AttributeParameters(env)
@@ -84,12 +85,19 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         """What was drawn for the running episode."""
         return self._drawn
 
+    def number_from(self, first: int) -> None:
+        """Says that it is one of those with the numbers `first` on; before that they begin with 0.
+
+        It is as its number, of all the run's environments, that its episodes are seeded.
+        """
+        self._number = first + self._index
+
     def count_from(self, run_seed: int, begun: NDArray[np.int64]) -> None:
         """Goes to where some episodes had begun.
 
         Args:
             run_seed: of the run.
-            begun: (N,) how many, of all the run's environments.
+            begun: (N,) how many, of all environments beside it.
         """
         self._run_seed, self._begun = run_seed, int(begun[self._index])
 
@@ -132,9 +140,9 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Plays an episode from its beginning; returns the last observation.
 
         Args:
-            drawn: (N,) values of its parameters by name, of all the run's environments; where there
+            drawn: (N,) values of its parameters by name, of all environments beside it; where there
                 is NaN, one is drawn.
-            lengths: (N,) steps of the episode, of all the run's environments.
+            lengths: (N,) steps of the episode, of all environments beside it.
             actions: (T, N, ...) the last T steps' actions, T being the greatest length.
         """
         observation, _ = self._begin(pick(drawn, self._index), None)
@@ -163,7 +171,7 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
         self, drawn: Mapping[str, float], options: dict[str, Any] | None
     ) -> tuple[Any, dict[str, Any]]:
         """Begins the next episode, with some parameters' values; the others are drawn."""
-        number = (self._run_seed, self._index, self._begun)
+        number = (self._run_seed, self._number, self._begun)
         self._begun += 1
         self._steps = 0
         self._drawn = {**self._parameters.draw(*number), **drawn}
@@ -185,7 +193,7 @@ class RepeatableEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
             said = f"{type(error).__name__}: {error}".removesuffix(": ")
             reason = f"{said} ({place.filename}:{place.lineno})"
         return EnvironmentFailure(
-            f"environment {self._index} of {self._name!r} failed in {call} of its episode "
+            f"environment {self._number} of {self._name!r} failed in {call} of its episode "
             f"{self._begun}: {reason}"
         )
 

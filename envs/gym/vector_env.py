@@ -70,6 +70,13 @@ class GymEnvironment(Environment):
 
     Settings = GymSettings
     snapshot: ClassVar[type[GymTransition]] = GymTransition
+    state_axes: ClassVar[Mapping[str, Any]] = {
+        "begun": 0,
+        "lengths": 0,
+        "actions": 1,
+        "observations": 0,
+        "parameters": 0,
+    }
 
     def __init__(self, settings: GymSettings, rewards: Sequence[RewardTerm[Any]], seed: int = 0):
         self._rewards = fitting(rewards, self.snapshot)
@@ -108,6 +115,10 @@ class GymEnvironment(Environment):
         assert isinstance(settings, GymSettings)
         module, colon, _ = settings.id.partition(":")
         return (module,) if colon else ()
+
+    def number_from(self, first: int) -> None:
+        """See `Environment.number_from`."""
+        self._call("number_from", first)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
