@@ -21,6 +21,8 @@ from rewards.reward import RewardTerm
 from trainers.algorithms.base import Algorithm
 from trainers.common.devices import resolve_device
 from trainers.common.errors import UserError, suggestion
+from trainers.distributed.states import Axes
+from trainers.distributed.world import ALONE, World
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import EpisodeBatch
 from trainers.experience.frames import frame_spaces
@@ -47,6 +49,7 @@ class Session:
         run: the settings.
         registries: where the default encoders are found.
         stop_requested: asked before every step of the environments.
+        world: the processes of the run, of which each has such a session.
 
     Attributes:
         env_runner: the environments.
@@ -63,23 +66,26 @@ class Session:
         run: RunSettings,
         registries: Registries,
         stop_requested: Callable[[], bool] = lambda: False,
+        world: World = ALONE,
     ):
-        device = resolve_device(run.device)
+        device = resolve_device(world.device(run.device))
         self._check_first_pass = partial(check_first_pass, run=run, registries=registries)
+        self.world = world
         self.curriculum = build_curriculum(run)
         self._parameters = run.environment_parameters
         self._curriculum_state: State = (
             self.curriculum.initial_state() if self.curriculum is not None else {}
         )
-        env = build_environment(run, run.seed)
+        env = build_environment(own_part(run, world), run.seed)
         try:
+            _number(run, env, world)
             self._check_parameters(env)
             _warn_of_what_learns_badly(run, env)
             factory = build_factory(run, registries, env)
             _check_network_size(run, factory)
             torch.manual_seed(run.seed)
             generator = torch.Generator(device).manual_seed(run.seed)
-            self.env_runner = EnvRunner(env, stop_requested)
+            self.env_runner = EnvRunner(env, stop_requested, world)
             self.metadata = Metadata.of_run(run, registries, env)
             self.algorithm: Algorithm = run.trainer.cls(
                 factory, run.trainer.settings, self.env_runner, generator, device
@@ -161,7 +167,7 @@ class Session:
         return dict(self.algorithm.policy.state_dict())
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything but the weights; see `resumable`."""
+        """Everything but the weights; see `resumable`. Of the environments this process's share."""
         return {
             ALGORITHM: self.algorithm.state_dict(),
             "interaction": self.env_runner.state_dict(),  # checkpoints have always called it so
@@ -169,16 +175,33 @@ class Session:
         }
 
     def load_state_dict(self, weights: dict[str, Tensor], state: Mapping[str, Any]) -> None:
-        """Goes back to a state."""
+        """Goes back to a state; see `own_state`."""
         self.algorithm.load_state_dict(weights, state[ALGORITHM])
         if self.curriculum is not None:
             self._curriculum_state = state["curriculum"]
         self.env_runner.set_parameters(self._parameters_now())
         self.env_runner.load_state_dict(state["interaction"])
 
+    def joined_state(self, state: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The state of all processes, which each of them has one of; it is what is saved."""
+        return self.world.state(state, self._state_axes)
+
+    def own_state(self, state: Mapping[str, Any]) -> Mapping[str, Any]:
+        """This process's share of a state that was saved, by however many processes.
+
+        Raises:
+            ValueError: it is that of another number of environments.
+        """
+        return self.world.own(state, self._state_axes, self.env_runner.share)
+
     def close(self) -> None:
         """Ends the environments."""
         self.env_runner.env.close()
+
+    @property
+    def _state_axes(self) -> Axes:
+        algorithm = getattr(self.algorithm, "state_axes", {})
+        return {ALGORITHM: algorithm, "interaction": self.env_runner.state_axes}
 
     def _parameters_now(self) -> dict[str, ParameterValue]:
         lesson = (
@@ -241,6 +264,44 @@ def _warn_of_what_learns_badly(run: RunSettings, env: Environment) -> None:
                 "the environment's space, and they are scaled to [0, 1], as networks need it",
                 name,
             )
+
+
+def own_part(run: RunSettings, world: World) -> RunSettings:
+    """The run with no more environments than this process's share.
+
+    Raises:
+        UserError: they can't be divided evenly.
+    """
+    count = getattr(run.environment.settings, "num_envs", 1)
+    if count % world.size:
+        raise UserError(
+            f"environment.num_envs: {count} environments can't be divided among the "
+            f"{world.size} ranks evenly: use a multiple of {world.size}, or other ranks "
+            "(--nproc-per-node, --nnodes)"
+        )
+    return run.with_environments(count // world.size)
+
+
+def _number(run: RunSettings, env: Environment, world: World) -> None:
+    """Says to environments which of the run's they are.
+
+    Raises:
+        UserError: there are several processes, and environment or algorithm are not made for that.
+    """
+    if world.size > 1 and not hasattr(run.trainer.cls, "state_axes"):
+        raise UserError(
+            f"trainer: {run.trainer.name!r} does not say how it runs in several processes "
+            "(state_axes): run it in one, without torchrun"
+        )
+    try:
+        env.number_from(world.share(env.num_envs).first)
+    except NotImplementedError as error:
+        if world.size == 1:
+            return
+        raise UserError(
+            f"environment: {run.environment.name!r} does not say how it is divided among several "
+            "processes (number_from): run it in one, without torchrun"
+        ) from error
 
 
 def build_environment(run: RunSettings, seed: int) -> Environment:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Protocol
 from torch import Tensor
 
 from trainers.common.trainer_settings import TrainerSettings
+from trainers.distributed.states import Axes
 from trainers.networks.factory import NetworkFactory
 from trainers.networks.policy_network import PolicyNetwork
 
@@ -24,11 +25,14 @@ class Algorithm(Protocol):
         Settings: its model, of `TrainerSettings`.
         tags: what each statistic of `update` says, by its tag, for the reference.
         policy: what acts, and what is saved as the weights.
+        state_axes: which axis of its state's arrays has an entry for each environment; declared by
+            those that can learn in several processes (see `trainers.distributed`).
         collection_steps: steps that `collect` takes, over all environments.
     """
 
     Settings: ClassVar[type[TrainerSettings]]
     tags: ClassVar[Mapping[str, str]]
+    state_axes: ClassVar[Axes]
     policy: PolicyNetwork
     collection_steps: int
 

@@ -20,6 +20,7 @@ from trainers.algorithms.off_policy import (
     OffPolicyHyperparameters,
     OffPolicySettings,
 )
+from trainers.distributed.states import EACH
 from trainers.experience.env_runner import EnvRunner
 from trainers.networks.deterministic import DeterministicPolicy, DeterministicSettings
 from trainers.networks.factory import NetworkFactory
@@ -61,6 +62,7 @@ class DDPG(OffPolicyAlgorithm):
         "Policy/Noise": "Deviation of the exploration noise, of actions in [-1, 1].",
         **OffPolicyAlgorithm.tags,
     }
+    state_axes: ClassVar[Mapping[str, Any]] = {"noise": 0, "replay_buffer": EACH}
     policy: DeterministicPolicy
     _hyperparameters: DDPGHyperparameters
 
@@ -104,7 +106,8 @@ class DDPG(OffPolicyAlgorithm):
     def _explore(self, observations: Observations, features: FrameFeatures) -> Tensor:
         actions = self.policy.online.act(observations, features.actor)
         sigma = self._hyperparameters.sigma(self._env_runner.step_count / self._settings.max_steps)
-        return (actions + sigma * self._noise.sample(self._generator)).clamp(-1.0, 1.0)
+        noise = self._noise.sample(self._generator, self._env_runner.share)
+        return (actions + sigma * noise).clamp(-1.0, 1.0)
 
     def _episodes_ended(self, done: NDArray[np.bool_]) -> None:
         self._noise.restart(torch.from_numpy(done).to(self._device))

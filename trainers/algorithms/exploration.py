@@ -10,6 +10,7 @@ from pydantic import BaseModel, Field
 from torch import Tensor
 
 from trainers.algorithms.schedules import CONSTANT, Schedule
+from trainers.common.share import Share
 
 
 class _NoiseSettings(BaseModel, frozen=True, extra="forbid"):
@@ -64,8 +65,8 @@ class Noise(Protocol):
 
     state: Tensor
 
-    def sample(self, generator: torch.Generator) -> Tensor:
-        """The next noise, (N, A)."""
+    def sample(self, generator: torch.Generator, share: Share | None = None) -> Tensor:
+        """The next noise, (N, A); of a share of environments that others draw for alike."""
 
     def restart(self, ended: Tensor) -> None:
         """Forgets what came before, where an episode ended (N,)."""
@@ -78,9 +79,9 @@ class Gaussian:
         self._shape = shape
         self.state = torch.empty(0, device=device)
 
-    def sample(self, generator: torch.Generator) -> Tensor:
+    def sample(self, generator: torch.Generator, share: Share | None = None) -> Tensor:
         """See `Noise.sample`."""
-        return torch.randn(self._shape, generator=generator, device=self.state.device)
+        return _normal(self._shape, generator, share, self.state.device)
 
     def restart(self, ended: Tensor) -> None:
         """See `Noise.restart`; there is nothing to forget."""
@@ -98,13 +99,21 @@ class OrnsteinUhlenbeck:
         self._kick = math.sqrt(-math.expm1(-2.0 * theta) / (2.0 * theta))
         self.state = torch.zeros(shape, device=device)
 
-    def sample(self, generator: torch.Generator) -> Tensor:
+    def sample(self, generator: torch.Generator, share: Share | None = None) -> Tensor:
         """See `Noise.sample`."""
         # x_{t+1} = exp(-theta) x_t + sqrt((1 - exp(-2 theta)) / (2 theta)) N(0, 1)
-        kick = torch.randn(self.state.shape, generator=generator, device=self.state.device)
+        kick = _normal(self.state.shape, generator, share, self.state.device)
         self.state = self._decay * self.state + self._kick * kick
         return self.state
 
     def restart(self, ended: Tensor) -> None:
         """See `Noise.restart`."""
         self.state = self.state.masked_fill(ended[:, None], 0.0)
+
+
+def _normal(
+    shape: tuple[int, ...], generator: torch.Generator, share: Share | None, device: torch.device
+) -> Tensor:
+    """Independent normal numbers of standard deviation 1."""
+    share = share or Share.whole(shape[0])
+    return share.drawn(torch.randn, shape, generator=generator, device=device)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,6 +24,7 @@ from trainers.algorithms.optimization import (
     set_learning_rates,
 )
 from trainers.algorithms.schedules import CONSTANT, Schedule
+from trainers.common.errors import UserError
 from trainers.experience.collector import BehaviorOutput, CollectedStep, Collector
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.memory import check_room
@@ -169,11 +171,17 @@ class OffPolicyAlgorithm(ABC):
         env, size = env_runner.env, policy.scale.size
         self._seen = {*policy.sees, *policy.critic_sees}
         self._actions_shape = (env.num_envs, size)
-        self.collection_steps = settings.time_horizon * env.num_envs
+        self.collection_steps = settings.time_horizon * env_runner.num_envs
         self._max_gradient_norm = hyper.max_gradient_norm or float("inf")
+        if hyper.random_shift_px and env_runner.world.size > 1:
+            raise UserError(
+                "trainer.hyperparameters.random_shift_px: how images are shifted is drawn in one "
+                "process alone: set it to 0, or run without torchrun"
+            )
         check_room(env, settings.time_horizon, "trainer.time_horizon")
+        capacity = -(-hyper.buffer_size // env_runner.num_envs) * env.num_envs
         self._buffer = ReplayBuffer(
-            env.single_observation_space, size, env.num_envs, hyper.buffer_size, device
+            env.single_observation_space, size, env.num_envs, capacity, device
         )
         self._augment = (
             RandomShift(hyper.random_shift_px, generator) if hyper.random_shift_px else unchanged
@@ -182,7 +190,8 @@ class OffPolicyAlgorithm(ABC):
         self._collected: list[CollectedStep[Tensor]] = []
         self._pending_updates = 0.0  # asked for by transitions, and not made yet
         self._steps_taken: list[Tensor] = []  # in this round
-        self._improve = Captured(self._improve_all, generator, device)
+        self._weight = 1.0  # of one's own transitions among those of a minibatch
+        self._improve = self._captured()
 
     # -- the subclass's --------------------------------------------------------------------------
 
@@ -211,11 +220,12 @@ class OffPolicyAlgorithm(ABC):
         """See `Algorithm.collect`."""
         self._collected = []
         self._collector.begin()
-        for _ in range(self._settings.time_horizon):
-            # No frame is kept here: the buffer has each once.
-            step = self._collector.collect_step(self._collector.frame_store(1))
-            self._collected.append(step)
-            self._episodes_ended(step.step.done)
+        with self._env_runner.world.together():
+            for _ in range(self._settings.time_horizon):
+                # No frame is kept here: the buffer has each once.
+                step = self._collector.collect_step(self._collector.frame_store(1))
+                self._collected.append(step)
+                self._episodes_ended(step.step.done)
 
     def encode_frames(self, frames: dict[str, Tensor]) -> FrameFeatures:
         """See `collector.Behavior.encode_frames`."""
@@ -234,7 +244,9 @@ class OffPolicyAlgorithm(ABC):
 
     def _uniform(self, shape: tuple[int, int]) -> Tensor:
         """Numbers from 0 to 1."""
-        return torch.rand(shape, generator=self._generator, device=self._device)
+        return self._env_runner.share.drawn(
+            torch.rand, shape, generator=self._generator, device=self._device
+        )
 
     # -- learning --------------------------------------------------------------------------------
 
@@ -245,14 +257,14 @@ class OffPolicyAlgorithm(ABC):
         scheduled = self._schedule(run_fraction)
         self._store_collected()
         hyper = self._hyperparameters
-        if len(self._buffer) >= hyper.buffer_init_steps:
+        if len(self._buffer) * self._env_runner.world.size >= hyper.buffer_init_steps:
             self._pending_updates += self.collection_steps * hyper.updates_per_step
         rounds, self._pending_updates = divmod(self._pending_updates, hyper.policy_delay)
         if not rounds:
             return scheduled
         drawn = (int(rounds), hyper.policy_delay, hyper.batch_size)
         statistics = []
-        for indices in self._buffer.sample(drawn, self._generator):
+        for indices in self._buffer.sample(drawn, self._generator, self._env_runner.num_envs):
             self._env_runner.check_stop()
             statistics.append(self._improve(indices))
         return self._means(statistics) | scheduled
@@ -267,6 +279,7 @@ class OffPolicyAlgorithm(ABC):
         for step in torch.cat([each.pop(STEPS) for each in statistics]).tolist():
             check_finite(step, self._env_runner.step_count)
         means = torch.stack([torch.stack(tuple(each.values())) for each in statistics]).mean(dim=0)
+        (means,) = self._env_runner.mean([means], 1.0)
         return dict(zip(statistics[0], means.tolist(), strict=True))
 
     def _schedule(self, run_fraction: float) -> dict[str, float]:
@@ -280,11 +293,18 @@ class OffPolicyAlgorithm(ABC):
         """Updates the critic once for each of (policy_delay, B), then the actor and the targets."""
         self._steps_taken = []
         for each in indices:
-            statistics = self._improve_critic(each)
-        statistics |= self._improve_actor(each)
+            own, self._weight = self._env_runner.share.own(each)
+            statistics = self._improve_critic(own)
+        statistics |= self._improve_actor(own)
         self.policy.update_targets()
-        detached = {name: value.detach() for name, value in statistics.items()}
+        detached = {name: self._weight * value.detach() for name, value in statistics.items()}
         return detached | {STEPS: torch.stack(self._steps_taken)}
+
+    def _captured(self) -> Callable[[Tensor], dict[str, Tensor]]:
+        """`_improve_all`, in a graph where nothing has to be told to other processes meanwhile."""
+        if self._env_runner.world.size > 1:
+            return self._improve_all
+        return Captured(self._improve_all, self._generator, self._device)
 
     def _store_collected(self) -> None:
         """Moves what was collected to the buffer and to the statistics of the observations.
@@ -295,13 +315,16 @@ class OffPolicyAlgorithm(ABC):
         for step in collected:
             actions = step.acted.output.cpu().numpy()
             self._buffer.add(step.observations, actions, step.step, step.next_observations)
-        vectors = [step.vectors for step in collected]
-        self.policy.update_statistics({k: torch.cat([v[k] for v in vectors]) for k in vectors[0]})
+        vectors, all_rows = [step.vectors for step in collected], self._env_runner.all_rows
+        self.policy.update_statistics(
+            {k: all_rows(torch.cat([v[k] for v in vectors])) for k in vectors[0]}
+        )
 
     def _optimizer_step(self, name: str, loss: Tensor) -> None:
         """One step of the optimizer of that name, with clipped gradients, if all is finite."""
         optimizer, parameters = self._optimizers[name], self._parameters[name]
-        step = optimizer_step(optimizer, loss, parameters, self._max_gradient_norm)
+        mean = partial(self._env_runner.world.mean, weight=self._weight)
+        step = optimizer_step(optimizer, loss, parameters, self._max_gradient_norm, mean)
         self._steps_taken.append(step)
 
     # -- the state -------------------------------------------------------------------------------
@@ -325,4 +348,4 @@ class OffPolicyAlgorithm(ABC):
             load_optimizer(optimizer, state[f"{name}_optimizer"])
         self._generator.set_state(state["generator"])
         self._pending_updates = state["due"]
-        self._improve = Captured(self._improve_all, self._generator, self._device)
+        self._improve = self._captured()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any, Literal
+from collections.abc import Iterable, Mapping
+from functools import partial
+from typing import Any, ClassVar, Literal
 
 import torch
 from gymnasium.spaces import Box
@@ -15,6 +16,7 @@ from trainers.algorithms.schedules import LINEAR, Schedule
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.memory import check_room
+from trainers.experience.returns import explained_variance, normalize
 from trainers.experience.reward_normalizer import RewardNormalizer
 from trainers.experience.rollout import Rollout
 from trainers.experience.rollout_collector import RolloutCollector
@@ -79,6 +81,10 @@ class OnPolicyAlgorithm:
         UserError: mirrored noise was asked for, and actions are discrete.
     """
 
+    state_axes: ClassVar[Mapping[str, Any]] = {
+        "collector": {"remembered": 0, "reward_normalizer": {"carried": 0}}
+    }
+
     def __init__(
         self,
         policy: ActorCritic,
@@ -96,17 +102,21 @@ class OnPolicyAlgorithm:
                 "trainer.hyperparameters.antithetic: mirrored noise is of continuous actions, and "
                 "the environment's are discrete: leave it out"
             )
-        count = env_runner.env.num_envs
-        steps = -(-hyperparameters.buffer_size // count)
-        self.collection_steps = steps * count
+        steps = -(-hyperparameters.buffer_size // env_runner.num_envs)
+        self.collection_steps = steps * env_runner.num_envs
         check_room(env_runner.env, steps, "trainer.hyperparameters.buffer_size")
+        reward_normalizer = (
+            RewardNormalizer(env_runner.env.num_envs, self._gamma)
+            if hyperparameters.normalize_rewards
+            else None
+        )
         self._collector = RolloutCollector(
             policy,
             env_runner,
             steps,
             generator,
             device,
-            RewardNormalizer(count, self._gamma) if hyperparameters.normalize_rewards else None,
+            reward_normalizer,
             antithetic=hyperparameters.antithetic,
         )
         self._compares_tries = hyperparameters.baseline == "frame"
@@ -141,12 +151,30 @@ class OnPolicyAlgorithm:
             raise RuntimeError("update() comes after collect()")
         return rollout
 
-    def _optimizer_step(self, loss: Tensor) -> Tensor:
+    def _show(self, rollout: Rollout) -> None:
+        """Shows all processes' vector observations to the encoders that standardise."""
+        all_rows = self._env_runner.all_rows
+        self.policy.update_statistics({k: all_rows(own) for k, own in rollout.vectors.items()})
+
+    def _explained_variance(self, rollout: Rollout) -> float:
+        """Of all processes' returns."""
+        all_rows = self._env_runner.all_rows
+        return explained_variance(all_rows(rollout.returns), all_rows(rollout.values))
+
+    def _normalized(self, advantages: Tensor) -> Tensor:
+        """One's own, by the mean and the deviation of those of all processes."""
+        return normalize(advantages, self._env_runner.all_rows(advantages))
+
+    def _optimizer_step(self, loss: Tensor, weight: float) -> Tensor:
         """One step of gradient descent, if all is finite; see `optimizer_step`.
+
+        Args:
+            loss: of one's own transitions.
+            weight: see `Minibatch`.
 
         Raises:
             StopRequested: the run is to stop; nothing was changed.
         """
-        self._env_runner.check_stop()
         parameters = [p for group in self._optimizer.param_groups for p in group["params"]]
-        return optimizer_step(self._optimizer, loss, parameters, self._max_gradient_norm)
+        mean = partial(self._env_runner.mean, weight=weight)
+        return optimizer_step(self._optimizer, loss, parameters, self._max_gradient_norm, mean)

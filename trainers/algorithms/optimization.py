@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from trainers.common.errors import NonFiniteError
+
+Mean = Callable[[Sequence[Tensor]], Sequence[Tensor]]
+"""From what one process has to what all processes of a run have on average."""
+
+
+def unchanged(own: Sequence[Tensor]) -> Sequence[Tensor]:
+    """What one process has, where there are no others. See `Mean`."""
+    return own
 
 
 def adam(
@@ -45,6 +53,7 @@ def optimizer_step(
     loss: Tensor,
     parameters: Sequence[nn.Parameter],
     max_gradient_norm: float,
+    mean: Mean = unchanged,
 ) -> Tensor:
     """Takes one step down the gradient of a loss with respect to some parameters, and no others.
 
@@ -56,15 +65,18 @@ def optimizer_step(
         loss: a number.
         parameters: what may change; frozen ones among them stay as they are.
         max_gradient_norm: the gradient is clipped to this norm.
+        mean: over all processes of a run, of the loss and the gradients.
 
     Returns:
         The loss and its gradient's norm before it was clipped, (2,), without a gradient.
     """
     learned = [parameter for parameter in parameters if parameter.requires_grad]
-    gradients = torch.autograd.grad(loss, learned, allow_unused=True)
-    for parameter, gradient in zip(learned, gradients, strict=True):
-        parameter.grad = gradient if gradient is None else _laid_out_as(parameter, gradient)
-    norm = nn.utils.get_total_norm([part for part in gradients if part is not None])
+    own = torch.autograd.grad(loss, learned, allow_unused=True)
+    loss, *gradients = mean([loss, *(part for part in own if part is not None)])
+    left = iter(gradients)
+    for parameter, part in zip(learned, own, strict=True):
+        parameter.grad = None if part is None else _laid_out_as(parameter, next(left))
+    norm = nn.utils.get_total_norm(gradients)
     if math.isfinite(max_gradient_norm):
         nn.utils.clip_grads_with_norm_(learned, max_gradient_norm, norm)
     loss_and_norm = torch.stack((loss.detach(), norm))

@@ -18,7 +18,6 @@ from trainers.algorithms.optimization import check_finite, set_learning_rates
 from trainers.algorithms.schedules import CONSTANT, LINEAR, Schedule
 from trainers.common.averager import Averager
 from trainers.experience.env_runner import EnvRunner
-from trainers.experience.returns import explained_variance, normalize
 from trainers.experience.rollout import Rollout
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Distribution
@@ -143,23 +142,22 @@ class PPO(OnPolicyAlgorithm):
         """See `Algorithm.update`."""
         rollout = self._pop_rollout()
         scheduled = self._schedule(run_fraction)
-        advantages = normalize(rollout.advantages)
+        advantages = self._normalized(rollout.advantages)
         averager = Averager()
         for _ in range(self._hyperparameters.num_epoch):
             if not self._epoch(rollout, advantages, scheduled, averager):
                 break
-        self.policy.update_statistics(rollout.vectors)
-        means, hyper = averager.means(), self._hyperparameters
+        self._show(rollout)
+        means, hyper = self._env_runner.means(averager), self._hyperparameters
         if hyper.desired_kl is not None:
             desired = hyper.desired_kl_schedule.value(hyper.desired_kl, run_fraction)
             self._rate_scale *= rate_change(means[KL], desired)
-        variance = explained_variance(rollout.returns, rollout.values)
         return means | {
             "Policy/Learning Rate": scheduled.learning_rate,
             "Policy/Critic Learning Rate": scheduled.critic_learning_rate,
             "Policy/Epsilon": scheduled.epsilon,
             "Policy/Beta": scheduled.beta,
-            "Policy/Explained Variance": variance,
+            "Policy/Explained Variance": self._explained_variance(rollout),
         }
 
     def _schedule(self, run_fraction: float) -> _Scheduled:
@@ -188,7 +186,8 @@ class PPO(OnPolicyAlgorithm):
     ) -> bool:
         """One pass over the rollout; False once the policy has moved far enough."""
         hyper = self._hyperparameters
-        for rows in rollout.minibatches(hyper.batch_size, self._generator):
+        for batch in rollout.minibatches(hyper.batch_size, self._generator):
+            rows = batch.rows
             distribution, values = self.policy(rollout.observations(rows))
             policy_loss, divergence, clip_fraction = surrogate_loss(
                 distribution,
@@ -206,13 +205,15 @@ class PPO(OnPolicyAlgorithm):
             for weight, term in ((-scheduled.beta, entropy), (hyper.kl_penalty, divergence)):
                 if weight:  # the gradient of what weighs nothing costs as much as any
                     loss = loss + weight * term
-            step = self._optimizer_step(loss)
+            step = self._optimizer_step(loss, batch.weight)
             statistics = torch.stack((divergence, clip_fraction, policy_loss, value_loss, entropy))
+            if hyper.target_kl is not None:  # which all processes have to agree on
+                (statistics,) = self._env_runner.mean([statistics], batch.weight)
             # All at once: on an accelerator each number read waits for all that is under way.
             *loss_and_norm, kl, _, _, _, _ = numbers = torch.cat((step, statistics)).tolist()
             check_finite(loss_and_norm, self._env_runner.step_count)
             means = numbers[len(loss_and_norm) :]
-            averager.add(dict(zip(STATISTICS, means, strict=True)), len(rows))
+            averager.add(dict(zip(STATISTICS, means, strict=True)), batch.own_count)
             if hyper.target_kl is not None and kl > hyper.target_kl:
                 return False
         return True

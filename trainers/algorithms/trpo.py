@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Literal
 
 import torch
@@ -24,11 +25,15 @@ from torch.nn import functional as F
 from trainers.algorithms.base import TrainerSettings
 from trainers.algorithms.conjugate_gradient import conjugate_gradient
 from trainers.algorithms.on_policy import OnPolicyAlgorithm, OnPolicyHyperparameters
-from trainers.algorithms.optimization import check_finite, set_learning_rates
+from trainers.algorithms.optimization import (
+    Mean,
+    check_finite,
+    set_learning_rates,
+    unchanged,
+)
 from trainers.algorithms.schedules import CONSTANT, Schedule
 from trainers.common.averager import Averager
 from trainers.experience.env_runner import EnvRunner
-from trainers.experience.returns import explained_variance, normalize
 from trainers.experience.rollout import Rollout
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
 from trainers.networks.distributions import Distribution
@@ -140,12 +145,11 @@ class TRPO(OnPolicyAlgorithm):
         set_learning_rates(self._optimizer, [rate])
         statistics = self._improve_policy(rollout, delta)
         statistics |= self._fit_critic(rollout)
-        self.policy.update_statistics(rollout.vectors)
-        variance = explained_variance(rollout.returns, rollout.values)
+        self._show(rollout)
         return statistics | {
             "Policy/Learning Rate": rate,
             "Policy/Delta": delta,
-            "Policy/Explained Variance": variance,
+            "Policy/Explained Variance": self._explained_variance(rollout),
         }
 
     def _improve_policy(self, rollout: Rollout, delta: float) -> dict[str, float]:
@@ -153,19 +157,21 @@ class TRPO(OnPolicyAlgorithm):
         rows = rollout.in_shuffle_groups()
         observations = rollout.observations(rows)
         actions, log_probs = rollout.actions[rows], rollout.log_probs[rows]
-        advantages = normalize(rollout.advantages)[rows]
+        advantages = self._normalized(rollout.advantages)[rows]
+        mean = partial(self._env_runner.mean, weight=len(rows) / len(rollout.all_groups))
 
         def gain_of(distribution: Distribution) -> Tensor:
             return surrogate_gain(distribution, actions, log_probs, advantages)
 
         distribution = self.policy.distribution(observations)
         gain, old = gain_of(distribution), distribution.detach()
-        gradient = flat_gradient(gain, self._theta)
+        gain, gradient = mean([gain, flat_gradient(gain, self._theta)])
         check_finite((-gain.item(), gradient.norm().item()), self._env_runner.step_count)
 
         def measure() -> tuple[Tensor, Tensor]:
             new = self.policy.distribution(observations)
-            return gain_of(new), old.kl(new).mean()
+            gain, divergence = mean([gain_of(new), old.kl(new).mean()])
+            return gain, divergence
 
         step = self._step(rollout, gradient, delta)
         search = line_search(
@@ -179,7 +185,7 @@ class TRPO(OnPolicyAlgorithm):
         )
         return {
             "Losses/Policy Loss": -search.gain,
-            "Policy/Entropy": old.entropy().mean().item(),
+            "Policy/Entropy": mean([old.entropy().mean()])[0].item(),
             "Policy/KL": search.divergence,
             "Policy/Line Search Steps": float(search.trials),
             "Policy/Step Accepted": float(search.accepted),
@@ -188,11 +194,12 @@ class TRPO(OnPolicyAlgorithm):
     def _step(self, rollout: Rollout, gradient: Tensor, delta: float) -> Tensor:
         """The step of a gradient, with the Fisher matrix over a part of the rollout."""
         hyper = self._hyperparameters
-        size = max(1, round(hyper.fisher_fraction * len(rollout)))
-        rows = next(rollout.minibatches(size, self._generator))
+        size = max(1, round(hyper.fisher_fraction * len(rollout.all_groups)))
+        rows, weight = next(rollout.minibatches(size, self._generator))
+        mean = partial(self._env_runner.mean, weight=weight)
         with _differentiable_twice(self.policy):
             distribution = self.policy.distribution(rollout.observations(rows))
-            fisher = fisher_product(distribution, self._theta, hyper.damping)
+            fisher = fisher_product(distribution, self._theta, hyper.damping, mean)
         return kl_constrained_step(
             gradient,
             fisher,
@@ -205,13 +212,14 @@ class TRPO(OnPolicyAlgorithm):
         hyper = self._hyperparameters
         averager = Averager()
         for _ in range(hyper.num_epoch):
-            for rows in rollout.minibatches(hyper.batch_size, self._generator):
+            for batch in rollout.minibatches(hyper.batch_size, self._generator):
+                rows = batch.rows
                 values = self.policy.value(rollout.observations(rows))
                 loss = F.mse_loss(values, rollout.returns[rows])
-                step = self._optimizer_step(loss).tolist()
+                step = self._optimizer_step(loss, batch.weight).tolist()
                 check_finite(step, self._env_runner.step_count)
-                averager.add({"Losses/Value Loss": step[0]}, len(rows))
-        return averager.pop_means()
+                averager.add({"Losses/Value Loss": step[0]}, batch.own_count)
+        return self._env_runner.means(averager)
 
 
 def surrogate_gain(
@@ -240,7 +248,10 @@ def flat_gradient(
 
 
 def fisher_product(
-    distribution: Distribution, parameters: Sequence[nn.Parameter], damping: float
+    distribution: Distribution,
+    parameters: Sequence[nn.Parameter],
+    damping: float,
+    mean: Mean = unchanged,
 ) -> Product:
     """The damped Fisher matrix of a policy, as its product with a vector (n,).
 
@@ -249,6 +260,7 @@ def fisher_product(
             that leads to its parameters.
         parameters: the policy's, of n entries in all.
         damping: added to the diagonal.
+        mean: of products over all processes of a run.
     """
     # H = d^2/dtheta^2 E[KL(pi_old || pi_theta)] at theta = theta_old (appendix C.1): the actions'
     # expectation is exact, only the states are samples. Its gradient there is zero, its graph not.
@@ -260,7 +272,8 @@ def fisher_product(
         parts = torch.autograd.grad(
             gradient, parameters, vector, retain_graph=True, materialize_grads=True
         )
-        return _flat(parts) + damping * vector
+        (whole,) = mean([_flat(parts)])
+        return whole + damping * vector
 
     return product
 

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from curricula.samplers import ParameterValue
 from envs.environment import Environment, EnvironmentFailure
+from trainers.common.averager import Averager
 from trainers.common.errors import NonFiniteError
 from trainers.common.stopping import StopRequested, may_be_given_up
 from trainers.common.timers import timed
-from trainers.experience.episodes import Cohorts, EpisodeBatch
+from trainers.distributed.world import ALONE, World
+from trainers.experience.episodes import Cohorts, EpisodeBatch, concatenate, following
 
 
 @dataclass(frozen=True)
@@ -51,21 +54,34 @@ class Step:
 class EnvRunner:
     """Steps the environments, checks what they return, and adds up the episodes.
 
+    A run in several processes has one in each, for its share of the environments; the steps and the
+    episodes that are counted are those of all.
+
     Args:
-        env: the environments.
+        env: the environments, n of the run's N.
         stop_requested: asked before every step, and in updates.
+        world: the processes of the run.
 
     Attributes:
+        share: which of the run's environments are stepped here.
+        num_envs: N.
         observations: the present ones, as the environment gave them.
         step_count: steps taken in the run, over all environments.
         parameters_from: the number of the first episode with the environment's present parameters.
     """
 
-    def __init__(self, env: Environment, stop_requested: Callable[[], bool] = lambda: False):
-        self.env, self._stop_requested = env, stop_requested
+    def __init__(
+        self,
+        env: Environment,
+        stop_requested: Callable[[], bool] = lambda: False,
+        world: World = ALONE,
+    ):
+        self.env, self._stop_requested, self.world = env, stop_requested, world
+        self.share = world.share(env.num_envs)
+        self.num_envs = self.share.total
         self.step_count = 0
         self.observations: Mapping[str, NDArray[Any]] = {}
-        self._number = np.zeros(env.num_envs, np.int64)  # of the running episodes
+        self._number = np.zeros(self.num_envs, np.int64)  # of everyone's running episodes
         self._begun = 0
         self.parameters_from = 0
         self._open_books()
@@ -75,7 +91,9 @@ class EnvRunner:
         count = self.env.num_envs
         self._reward, self._length = np.zeros(count), np.zeros(count)
         self._terms: dict[str, NDArray[np.float64]] = {}
-        self._cohorts = Cohorts(count)
+        self._ended: list[EpisodeBatch] = []  # since episodes were numbered last
+        self._numbered_at = self.step_count
+        self._cohorts = Cohorts(self.num_envs)
 
     def set_parameters(self, parameters: Mapping[str, ParameterValue]) -> None:
         """Sets environment parameters; they are those of all episodes that begin from now on.
@@ -87,6 +105,7 @@ class EnvRunner:
             ValueError: the environment has no such parameter.
         """
         self.env.set_parameters(parameters)
+        self._number_episodes()
         self.parameters_from = self._begun
 
     def reset(self, seed: int | None = None) -> None:
@@ -100,10 +119,12 @@ class EnvRunner:
         """
         with self._stoppable():
             self.observations, _ = self.env.reset(seed=seed)
+        self._number_episodes()
         self._open_books()
         # All first episodes after a reset are of one cohort.
-        self._begun = -(-self._begun // self.env.num_envs) * self.env.num_envs
-        self._begin(np.ones(self.env.num_envs, bool))
+        self._begun = -(-self._begun // self.num_envs) * self.num_envs
+        self._number = self._begun + np.arange(self.num_envs)
+        self._begun += self.num_envs
         self._check_observations(self.observations)
 
     def step(self, actions: NDArray[Any]) -> Step:
@@ -115,10 +136,11 @@ class EnvRunner:
             EnvironmentFailure: one broke down; or an episode was truncated, and its last
                 observation is not there.
         """
-        self.check_stop()
-        with timed("environment"), self._stoppable(self.env.num_envs):
+        if self._stop_requested():
+            raise StopRequested
+        with timed("environment"), self._stoppable(self.num_envs):
             observations, reward, terminated, truncated, infos = self.env.step(actions)
-        self.step_count += self.env.num_envs
+        self.step_count += self.num_envs
         terms = infos.get("reward_terms", {})
         for name, values in terms.items():
             self._check(f"reward {name!r}", values)
@@ -139,13 +161,37 @@ class EnvRunner:
         return step
 
     def check_stop(self) -> None:
-        """Lets the run stop here: before each step, and in an update before each optimizer step.
+        """Lets the run stop here, in an update for instance; in all of its processes, or in none.
 
         Raises:
             StopRequested: it is to stop.
         """
-        if self._stop_requested():
+        if self.world.any(self._stop_requested()):
             raise StopRequested
+
+    def mean(self, tensors: Sequence[Tensor], weight: float) -> Sequence[Tensor]:
+        """Means over all transitions of means over one's own; lets the run stop here, too.
+
+        Args:
+            tensors: alike in all processes, gradients for instance.
+            weight: the share of all transitions that one's own are.
+
+        Raises:
+            StopRequested: it is to stop.
+        """
+        return self.world.mean(tensors, weight, stop=self._stop_requested())
+
+    def means(self, averager: Averager) -> dict[str, float]:
+        """Means over all that was added, in any process; an averager begins anew with it."""
+        return self.world.means(averager)
+
+    def all_rows(self, rows: Tensor) -> Tensor:
+        """Everyone's (T N, ...), by step, then by environment, where one's own are (T n, ...)."""
+        return self.world.all_rows(rows, self.env.num_envs)
+
+    def all_groups(self, groups: Tensor) -> Tensor:
+        """Everyone's groups (T N,), as `all_rows`; numbered as they come first."""
+        return self.world.all_groups(groups, self.env.num_envs)
 
     @contextmanager
     def unstoppable(self) -> Iterator[None]:
@@ -164,17 +210,24 @@ class EnvRunner:
     @property
     def longest_episode(self) -> int:
         """Steps of the longest of the running episodes."""
-        return int(self._length.max())
+        return max(self.world.gather(int(self._length.max())))
 
     def pop_finished(self) -> EpisodeBatch:
         """The finished episodes of the cohorts that were completed since the last call.
 
         They come in the order in which they began; see `Cohorts` for why.
         """
+        self._number_episodes()
         return self._cohorts.pop(int(self._number.min()))
 
+    @property
+    def state_axes(self) -> Mapping[str, Any]:
+        """See `trainers.distributed.states`."""
+        return {"env": self.env.state_axes, "reward": 0, "length": 0, "terms": 0}
+
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on exactly."""
+        """Everything needed to go on exactly; of one's own environments."""
+        self._number_episodes()
         return {
             "env": self.env.state_dict(),
             "step_count": self.step_count,
@@ -206,10 +259,11 @@ class EnvRunner:
         self.step_count = state["step_count"]
         self._reward, self._length = state["reward"].copy(), state["length"].copy()
         self._terms = {name: values.copy() for name, values in state["terms"].items()}
-        count = self.env.num_envs
+        count = self.num_envs
         self._number = np.array(state.get("number", np.arange(count)))
         self._begun = state.get("begun", count)
         self.parameters_from = state.get("parameters_from", count)
+        self._ended, self._numbered_at = [], self.step_count
         self._cohorts = Cohorts(count)
         if "cohorts" in state:
             self._cohorts.load_state_dict(state["cohorts"])
@@ -234,11 +288,20 @@ class EnvRunner:
                 step = self.step_count + steps
                 raise EnvironmentFailure(f"step {step}: {failure}") from failure
 
-    def _begin(self, where: NDArray[np.bool_]) -> None:
-        """Numbers the episodes that begin in some environments (N,)."""
-        count = int(where.sum())
-        self._number[where] = self._begun + np.arange(count)
-        self._begun += count
+    def _number_episodes(self) -> None:
+        """Numbers the episodes that began since it was done last, in all processes.
+
+        By the step in which they began, then by environment, as if all were stepped here.
+        """
+        if self._numbered_at == self.step_count:
+            return
+        ended = concatenate(self.world.gather(concatenate(self._ended)))
+        ended = ended[np.argsort(ended.number)]
+        environment = ended.number % self.num_envs
+        number = following(self._number, environment, self._begun)
+        self._cohorts.add(replace(ended, number=number))
+        self._begun += len(ended)
+        self._ended, self._numbered_at = [], self.step_count
 
     def _add_up(
         self,
@@ -252,9 +315,11 @@ class EnvRunner:
         for name, values in terms.items():
             self._terms[name] = self._terms.get(name, 0.0) + values
         if done.any():
-            self._cohorts.add(
+            # Their numbers are known as soon as it is known where else episodes ended before them.
+            ended = self.step_count + self.share.first + np.flatnonzero(done)
+            self._ended.append(
                 EpisodeBatch(
-                    self._number[done],
+                    ended,
                     self._reward[done],
                     self._length[done],
                     {name: total[done] for name, total in self._terms.items()},
@@ -263,7 +328,6 @@ class EnvRunner:
             )
             for total in (self._reward, self._length, *self._terms.values()):
                 total[done] = 0.0
-            self._begin(done)
 
     def _check_observations(
         self, observations: Mapping[str, NDArray[Any]], of: NDArray[np.bool_] | None = None
@@ -281,7 +345,7 @@ class EnvRunner:
         if of is not None:
             broken[~of] = False
         if broken.any():
-            environment = int(np.argwhere(broken)[0][0])
+            environment = self.share.first + int(np.argwhere(broken)[0][0])
             value = np.asarray(values)[broken].flat[0]
             of_id = f" of {self.env.name!r}" if self.env.name else ""
             raise NonFiniteError(

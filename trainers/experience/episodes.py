@@ -17,7 +17,8 @@ class EpisodeBatch:
     """k finished episodes.
 
     Attributes:
-        number: (k,) each one's place in the order in which the run's episodes began, from 0.
+        number: (k,) each one's place in the order in which the run's episodes began, from 0; its
+            place in the order in which they ended, as long as the former is not known.
         rewards: (k,) cumulative rewards.
         lengths: (k,) steps.
         terms: (k,) cumulative weighted rewards by term.
@@ -66,6 +67,27 @@ def concatenate(parts: Sequence[EpisodeBatch]) -> EpisodeBatch:
             for name in dict.fromkeys(name for part in parts for name in part.episode_metrics)
         },
     )
+
+
+def following(
+    number: NDArray[np.int64], environment: NDArray[np.int64], begun: int
+) -> NDArray[np.int64]:
+    """Numbers (k,) of episodes that ended one after the other, in each of whose place one begins.
+
+    Args:
+        number: (N,) of the episodes that run; afterwards of those that run then.
+        environment: (k,) in which one ends.
+        begun: episodes that have begun; they are numbered in this order.
+    """
+    begins = begun + np.arange(len(environment))
+    order = np.argsort(environment, kind="stable")
+    where, begins = environment[order], begins[order]
+    again = where[1:] == where[:-1]  # the episode that ends is one that began here
+    first, last = np.r_[True, ~again][: len(where)], np.r_[~again, True][: len(where)]
+    ended = np.empty_like(begins)
+    ended[order] = np.where(first, number[where], np.roll(begins, 1))
+    number[where[last]] = begins[last]
+    return ended
 
 
 def _metric(episodes: EpisodeBatch, name: str) -> NDArray[np.float64]:

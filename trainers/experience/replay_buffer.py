@@ -141,11 +141,22 @@ class ReplayBuffer:
             self._frame_slots[rows] = torch.from_numpy(self._frame[rows])
         self._final_slots[here] = torch.from_numpy(self._final[here])
 
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
-        """Draws transitions, each as likely as any other: their indices, of some shape."""
-        drawn = torch.randint(len(self), shape, generator=generator, device=generator.device)
-        oldest = (self._row - self._length) * self._num_envs
-        return (oldest + drawn) % len(self._rewards)
+    def sample(
+        self, shape: tuple[int, ...], generator: torch.Generator, num_envs: int | None = None
+    ) -> Tensor:
+        """Draws transitions, each as likely as any other: their indices.
+
+        Args:
+            shape: of the indices.
+            generator: the source of randomness.
+            num_envs: N of a larger buffer of which this one is a share, and whose indices these are
+                (see `Share.own`).
+        """
+        count = self._num_envs if num_envs is None else num_envs
+        known = self._length * count
+        drawn = torch.randint(known, shape, generator=generator, device=generator.device)
+        oldest = (self._row - self._length) * count
+        return (oldest + drawn) % (self._rows * count)
 
     def observations(self, indices: Tensor, names: Collection[str]) -> Observations:
         """Observations before the transitions (B,), those of `names`."""

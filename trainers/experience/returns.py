@@ -72,18 +72,19 @@ def leave_one_out(returns: Tensor, groups: Tensor) -> Tensor:
     return torch.where(size > 1, returns - (total - returns) / (size - 1).clamp(min=1), 0.0)
 
 
-def normalize(advantages: Tensor) -> Tensor:
+def normalize(advantages: Tensor, among: Tensor | None = None) -> Tensor:
     """Shift and scale to mean 0 and (biased) standard deviation 1.
 
     Equal values, a single one included, become 0.
 
     Args:
         advantages: Any shape; the statistics are taken over all entries, so leave out padding.
+        among: Those that the statistics are taken over instead.
 
     Returns:
         A tensor of the same shape.
     """
-    std, mean = torch.std_mean(advantages, correction=0)
+    std, mean = torch.std_mean(advantages if among is None else among, correction=0)
     return (advantages - mean) / (std + _EPSILON)
 
 

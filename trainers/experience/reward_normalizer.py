@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -36,12 +37,18 @@ class RewardNormalizer:
         """Standard deviation of the returns, by which rewards are divided."""
         return self._returns.deviation.item()
 
-    def __call__(self, rewards: Tensor, done: Tensor) -> Tensor:
+    def __call__(
+        self,
+        rewards: Tensor,
+        done: Tensor,
+        all_rows: Callable[[Tensor], Tensor] = lambda own: own,
+    ) -> Tensor:
         """Learns the scale from the next T steps of N environments, and scales them.
 
         Args:
             rewards: (T, N).
             done: (T, N) bool, the episode ended with that step.
+            all_rows: adds the rows of other processes, whose rewards have the same scale.
 
         Returns:
             (T, N), within +-10.
@@ -53,7 +60,7 @@ class RewardNormalizer:
             sums[row] += carried
             carried = discount * sums[row]
         self._carried = carried
-        self._returns.update(torch.from_numpy(sums).reshape(-1, 1))
+        self._returns.update(all_rows(torch.from_numpy(sums).reshape(-1, 1)))
         return (rewards / self.deviation).clamp(-CLIP, CLIP)
 
     def state_dict(self) -> dict[str, Any]:

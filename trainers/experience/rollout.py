@@ -4,14 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from trainers.common.errors import UserError
+from trainers.common.share import Share
 from trainers.experience.returns import leave_one_out
 from trainers.networks.observations import Observations, gather
 from trainers.networks.recurrent import Sequences
+
+
+class Minibatch(NamedTuple):
+    """What one optimizer step learns from.
+
+    Attributes:
+        rows: (b,) one's own of the B transitions that the processes of a run learn from together.
+        weight: b / B; of a process that has none of them 0, for a row that stands for none.
+    """
+
+    rows: Tensor
+    weight: float
+
+    @property
+    def own_count(self) -> int:
+        """Transitions of one's own."""
+        return len(self.rows) if self.weight else 0
 
 
 @dataclass(frozen=True)
@@ -19,11 +38,13 @@ class Rollout:
     """M transitions and their frames. Tensors have the leading axis M unless said otherwise.
 
     Attributes:
+        share: whose transitions they are: T steps of n of N environments.
         frames: by name, (U, H, W, C).
         frame_index: which of the U frames belongs to each transition.
         vectors: by name, (M, n).
         shuffle_groups: the number, from 0, of the group that each belongs to, which stays
             together: the transitions of one frame or, of a policy with memory, of one sequence.
+        all_groups: (T N,) the same of the transitions of all environments.
         hidden_states: (M, m) of the policy before each; m is 0 without memory.
         actions: as the policy drew them, before any squashing, scaling and clipping.
         log_probs: of the actions under the policy that drew them.
@@ -32,10 +53,12 @@ class Rollout:
         returns: what the critic should have said.
     """
 
+    share: Share
     frames: dict[str, Tensor]
     frame_index: Tensor
     vectors: dict[str, Tensor]
     shuffle_groups: Tensor
+    all_groups: Tensor
     hidden_states: Tensor
     actions: Tensor
     log_probs: Tensor
@@ -92,15 +115,16 @@ class Rollout:
         """All rows (M,), those of one group side by side and in the order of time."""
         return self.shuffle_groups.argsort(stable=True)
 
-    def minibatches(self, size: int, generator: torch.Generator) -> Iterator[Tensor]:
-        """Splits all transitions at random into parts of `size` rows; the last may be smaller.
+    def minibatches(self, size: int, generator: torch.Generator) -> Iterator[Minibatch]:
+        """Splits all transitions at random into parts of `size`; the last may be smaller.
 
         Transitions of one group stay together, in the order of time: a frame is encoded once in a
         pass, and a sequence is cut at most where a part ends. Where every transition is a group of
         its own, this is a plain random split.
         """
-        count = int(self.shuffle_groups.max()) + 1
-        device = self.shuffle_groups.device
-        rank = torch.randperm(count, generator=generator, device=device)
-        order = torch.argsort(rank[self.shuffle_groups], stable=True)
-        yield from order.split(size)
+        count = int(self.all_groups.max()) + 1
+        device = self.all_groups.device
+        place = torch.randperm(count, generator=generator, device=device)
+        order = torch.argsort(place[self.all_groups], stable=True)
+        for rows in order.split(size):
+            yield Minibatch(*self.share.own(rows))

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from trainers.common.share import Share
 from trainers.experience.collector import BehaviorOutput, CollectedStep, Collector
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.frames import FrameStore
@@ -64,12 +65,16 @@ class SampledActions:
     Args:
         policy: the actor and the critic.
         generator: the source of the actions' randomness.
+        share: the environments that it acts in.
         antithetic: every second step mirrors the noise of the one before. Where both are tries at
             the same observations, whatever is even in the noise cancels in the policy's gradient.
     """
 
-    def __init__(self, policy: ActorCritic, generator: torch.Generator, *, antithetic: bool):
-        self._policy, self._generator, self._antithetic = policy, generator, antithetic
+    def __init__(
+        self, policy: ActorCritic, generator: torch.Generator, share: Share, *, antithetic: bool
+    ):
+        self._policy, self._antithetic = policy, antithetic
+        self._generator, self._share = generator, share
         self._noise: Tensor | None = None
         self.state_size = policy.state_size
 
@@ -92,7 +97,7 @@ class SampledActions:
         if self._noise is not None:
             draws, self._noise = distribution.mode() - self._noise, None
             return draws
-        draws = distribution.sample(self._generator)
+        draws = distribution.sample(self._generator, self._share)
         if self._antithetic:
             self._noise = draws - distribution.mode()
         return draws
@@ -124,7 +129,7 @@ class RolloutCollector:
     ):
         self._policy, self._env_runner, self._steps = policy, env_runner, steps
         self._device, self._reward_normalizer = device, reward_normalizer
-        self._behavior = SampledActions(policy, generator, antithetic=antithetic)
+        self._behavior = SampledActions(policy, generator, env_runner.share, antithetic=antithetic)
         self._collector = Collector(self._behavior, env_runner, device)
 
     @torch.no_grad()
@@ -132,23 +137,29 @@ class RolloutCollector:
         """Collects a rollout, with advantages and returns.
 
         Raises:
+            StopRequested: the run is to stop.
             NonFiniteError: a reward or an observation is NaN or infinite.
+            RankFailure: another process of the run failed.
         """
         collector = self._collector
         frames = collector.frame_store(self._steps)
         collector.begin()
         self._behavior.begin()
-        steps = [self._collect_step(frames) for _ in range(self._steps)]
+        with self._env_runner.world.together():
+            steps = [self._collect_step(frames) for _ in range(self._steps)]
         last = collector.to_tensors(self._env_runner.observations, collector.hidden_state)
         advantages, returns = self._estimate(steps, self._policy.value(last), gamma, lambd)
         frame_index = torch.cat([step.frame_index for step in steps])
         actions = torch.cat([step.actions for step in steps])
         distributions = [step.distribution for step in steps]
         distribution = type(distributions[0]).concatenate(distributions)
+        groups = self._sequences(steps) if self._policy.state_size else frame_index
         return Rollout(
+            share=self._env_runner.share,
             frames=frames.tensors(),
             frame_index=frame_index,
-            shuffle_groups=self._sequences(steps) if self._policy.state_size else frame_index,
+            shuffle_groups=groups,
+            all_groups=self._env_runner.all_groups(groups),
             hidden_states=torch.cat([step.hidden_state for step in steps]),
             vectors={
                 name: torch.cat([step.vectors[name] for step in steps]) for name in steps[0].vectors
@@ -245,7 +256,7 @@ class RolloutCollector:
         next_values = torch.cat([values[1:], last_values[None]])
         rewards = stack("reward", values.dtype)
         if self._reward_normalizer is not None:
-            rewards = self._reward_normalizer(rewards, done)
+            rewards = self._reward_normalizer(rewards, done, self._env_runner.all_rows)
         return gae(
             rewards,
             values,

@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from trainers.common.share import Share
+
 _LOG_2, _LOG_2_PI = math.log(2), math.log(2 * math.pi)
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(24)
 """Of a Gauss-Hermite rule: E f(x) = sum_k w_k f(x_k) / sqrt(2 pi) for a standard normal x."""
@@ -25,11 +27,14 @@ _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(24)
 class Distribution(Protocol):
     """A distribution over actions in each of B rows."""
 
-    def sample(self, generator: torch.Generator | None = None) -> Tensor:
+    def sample(
+        self, generator: torch.Generator | None = None, share: Share | None = None
+    ) -> Tensor:
         """Draw one action per row; no gradient flows through it.
 
         Args:
             generator: The source of randomness, on the distribution's device; None is torch's own.
+            share: Which of more rows these are, that other processes draw in the same way.
         """
         ...
 
@@ -86,14 +91,13 @@ class DiagonalGaussian:
                 f"{tuple(self.mean.shape)} it must be that or {tuple(self.mean.shape[-1:])}"
             )
 
-    def sample(self, generator: torch.Generator | None = None) -> Tensor:
-        """Draw one action per row, (B, A); no gradient flows through it.
-
-        Args:
-            generator: The source of randomness, on the distribution's device; None is torch's own.
-        """
+    def sample(
+        self, generator: torch.Generator | None = None, share: Share | None = None
+    ) -> Tensor:
+        """Draw one action per row, (B, A); see `Distribution.sample`."""
         with torch.no_grad():
-            noise = torch.randn(
+            noise = (share or Share.whole(len(self.mean))).drawn(
+                torch.randn,
                 self.mean.shape,
                 generator=generator,
                 dtype=self.mean.dtype,
@@ -209,18 +213,24 @@ class Categorical:
 
     logits: Tensor
 
-    def sample(self, generator: torch.Generator | None = None) -> Tensor:
-        """Draw one action per row, (B,) int64.
-
-        Args:
-            generator: The source of randomness, on the distribution's device; None is torch's own.
+    def sample(
+        self, generator: torch.Generator | None = None, share: Share | None = None
+    ) -> Tensor:
+        """Draw one action per row, (B,) int64; see `Distribution.sample`.
 
         Raises:
             RuntimeError: A logit is not finite.
         """
         with torch.no_grad():
             probabilities = F.softmax(self.logits, -1)
-            return torch.multinomial(probabilities, 1, generator=generator).squeeze(-1)
+            if share is None or share.is_whole:
+                return torch.multinomial(probabilities, 1, generator=generator).squeeze(-1)
+            # As multinomial does it: of exponential clocks with these rates the first to ring.
+            clocks = share.drawn(
+                lambda shape: probabilities.new_empty(shape).exponential_(generator=generator),
+                probabilities.shape,
+            )
+            return (probabilities / clocks).argmax(-1)
 
     def mode(self) -> Tensor:
         """Likeliest action of each row, (B,) int64."""
@@ -272,9 +282,11 @@ class MultiCategorical:
     logits: Tensor
     sizes: tuple[int, ...]
 
-    def sample(self, generator: torch.Generator | None = None) -> Tensor:
+    def sample(
+        self, generator: torch.Generator | None = None, share: Share | None = None
+    ) -> Tensor:
         """Draw one action per row, (B, A) int64; see `Categorical.sample`."""
-        return torch.stack([choice.sample(generator) for choice in self._choices], -1)
+        return torch.stack([choice.sample(generator, share) for choice in self._choices], -1)
 
     def mode(self) -> Tensor:
         """Likeliest action of each row, (B, A) int64."""

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from encoders.spaces import DepthImage, RgbImage
 from trainers.common.errors import UserError
+from trainers.common.share import Share
 from trainers.experience.frames import FrameStore
 from trainers.experience.rollout import Rollout
 
@@ -28,11 +29,14 @@ def rollout_of(
 ) -> Rollout:
     """A rollout whose only content is its frames; all else of a transition is its number."""
     numbers = torch.arange(len(frame_index), dtype=torch.float32)
+    groups = frame_index if shuffle_groups is None else shuffle_groups
     return Rollout(
+        share=Share.whole(1),
         frames={} if frames is None else {"depth": frames},
         frame_index=frame_index,
         vectors={"number": numbers[:, None]},
-        shuffle_groups=frame_index if shuffle_groups is None else shuffle_groups,
+        shuffle_groups=groups,
+        all_groups=groups,
         hidden_states=numbers[:, None],
         actions=numbers,
         log_probs=numbers,
@@ -110,7 +114,7 @@ def test_minibatches_are_a_partition_in_which_frames_stay_together(
     owners = np.repeat(np.arange(len(shares)), shares)
     frame_index = torch.from_numpy(np.random.default_rng(seed).permutation(owners))
     generator = torch.Generator().manual_seed(seed)
-    batches = list(rollout_of(frame_index).minibatches(size, generator))
+    batches = [rows for rows, _ in rollout_of(frame_index).minibatches(size, generator)]
     assert all(len(batch) == size for batch in batches[:-1])
     assert 1 <= len(batches[-1]) <= size
     order = torch.cat(batches)
@@ -137,7 +141,8 @@ def test_sequences_come_in_the_order_of_time_with_what_was_remembered_before_the
 @given(st.integers(1, 20), st.integers(0, 2**31))
 def test_a_sequence_is_cut_at_most_where_a_minibatch_ends(size: int, seed: int) -> None:
     rollout = rollout_of(torch.arange(15), shuffle_groups=SEQUENCES)
-    batches = list(rollout.minibatches(size, torch.Generator().manual_seed(seed)))
+    minibatches = rollout.minibatches(size, torch.Generator().manual_seed(seed))
+    batches = [rows for rows, _ in minibatches]
     pieces = []
     for rows in batches:
         sequences = rollout.observations(rows).sequences
@@ -168,9 +173,13 @@ def test_a_frame_is_taken_once_wherever_its_sequences_are() -> None:
 def test_frames_are_shuffled_anew_in_every_pass() -> None:
     frame_index = torch.arange(8).repeat_interleave(3)
     rollout, generator = rollout_of(frame_index), torch.Generator().manual_seed(0)
-    first, second = (torch.cat(list(rollout.minibatches(6, generator))) for _ in range(2))
+
+    def order(generator: torch.Generator) -> torch.Tensor:
+        return torch.cat([rows for rows, _ in rollout.minibatches(6, generator)])
+
+    first, second = order(generator), order(generator)
     assert first.tolist() != second.tolist()
-    again = torch.cat(list(rollout.minibatches(6, torch.Generator().manual_seed(0))))
+    again = order(torch.Generator().manual_seed(0))
     assert again.tolist() == first.tolist()
 
 
@@ -178,7 +187,7 @@ def test_with_a_frame_each_all_splits_are_equally_likely() -> None:
     rollout, generator = rollout_of(torch.arange(4)), torch.Generator().manual_seed(0)
     draws = 2400
     pairs = Counter(
-        tuple(sorted(next(rollout.minibatches(2, generator)).tolist())) for _ in range(draws)
+        tuple(sorted(next(rollout.minibatches(2, generator)).rows.tolist())) for _ in range(draws)
     )
     assert len(pairs) == 6
     expected = draws / 6

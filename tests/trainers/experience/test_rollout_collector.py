@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from torch import Tensor, nn
 
 from encoders.spaces import DepthImage
+from trainers.common.share import Share
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.reward_normalizer import RewardNormalizer
 from trainers.experience.rollout import Rollout
@@ -328,7 +329,7 @@ def test_sequences_run_again_from_their_stored_states_say_what_was_kept(
     for _ in range(2):
         rollout = collector.collect(0.9, 0.9)
         for size in (4, len(rollout)):
-            for rows in rollout.minibatches(size, generator):
+            for rows, _ in rollout.minibatches(size, generator):
                 is_what_the_policy_says(rollout, policy, rows)
         is_what_the_policy_says(rollout, policy, rollout.in_shuffle_groups())
         forgotten = policy(Observations({}, rollout.vectors))[1]
@@ -405,7 +406,8 @@ def test_every_second_step_mirrors_the_noise_of_the_one_before(
     make_factory: MakeFactory, antithetic: bool
 ) -> None:
     policy = ActorCritic(make_factory(PLAIN.spaces), PolicySettings(num_layers=0, initial_std=2.0))
-    behavior = SampledActions(policy, torch.Generator().manual_seed(0), antithetic=antithetic)
+    generator, everywhere = torch.Generator().manual_seed(0), Share.whole(500)
+    behavior = SampledActions(policy, generator, everywhere, antithetic=antithetic)
 
     def noise(x: float) -> Tensor:
         observations = Observations({}, {"x": torch.full((500, 1), x)}, None)
