@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.environment import Environment
 from envs.evaluation import EvaluationReport, Evaluator
 from trainers.common.errors import UserError, suggestion
 from trainers.common.timers import timed
@@ -17,7 +18,7 @@ from trainers.inference.policy import Policy
 from trainers.networks.network import evaluation_mode
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.figures import evaluation_tag, figure_values
-from trainers.reporting.films import EpisodeCamera
+from trainers.reporting.films import EpisodeCamera, Film
 from trainers.runfile.settings import EvaluationSettings, RunSettings
 from trainers.session import Session
 
@@ -61,12 +62,19 @@ class HeldOutEvaluation:
         collection_steps = session.algorithm.collection_steps
         _check_interval(settings, collection_steps)
         self._settings, self._stop_requested = settings, stop_requested
+        self._world = session.world
         self._evaluated_at = start_step - collection_steps
         self.begins_due = self.due(start_step)
-        self._env = evaluation_environment(run, settings.episodes)
+        with self._world.together():
+            # The first process evaluates for all of them.
+            self._env = (
+                evaluation_environment(run, settings.episodes) if self._world.writes else None
+            )
         self._network = session.algorithm.policy
         self.latest: dict[str, Any] = {}
         self.took_s = 0.0
+        self._drawn: DrawnActions | None = None
+        self._film: Film | None = None
         try:
             self._evaluate(start_step)
             self._check_target()
@@ -92,7 +100,7 @@ class HeldOutEvaluation:
     def log(self, log: RunLog) -> None:
         """Logs the latest report, and what can be drawn and filmed of it."""
         log.scalars(_tagged(self.latest), self.latest["step"])
-        if self._drawn.picture is not None:
+        if self._drawn is not None and self._drawn.picture is not None:
             log.image(DRAWN_TAG, self._drawn.picture, self.latest["step"])
         if self._film is not None:
             log.video(FILM_TAG, self._film.frames, self._film.fps, self.latest["step"])
@@ -123,11 +131,18 @@ class HeldOutEvaluation:
 
     def close(self) -> None:
         """Ends its environments."""
-        self._env.close()
+        if self._env is not None:
+            self._env.close()
 
     def _evaluate(self, step: int) -> None:
-        settings, env, network = self._settings, self._env, self._network
         start_s = time.monotonic()
+        with self._world.together():
+            report = {} if self._env is None else self._report(self._env)
+        self.took_s = time.monotonic() - start_s
+        self._evaluated_at, self.latest = step, {"step": step, **self._world.first(report)}
+
+    def _report(self, env: Environment) -> dict[str, Any]:
+        settings, network = self._settings, self._network
         # A new one each time: what it draws depends on the seed, not on the evaluations before.
         policy = Policy(
             network, env.single_observation_space, env.single_action_space, settings.seed
@@ -141,10 +156,9 @@ class HeldOutEvaluation:
                 pictures=drawn if evaluator.judges_first_action else None,
                 camera=camera, stop_requested=self._stop_requested,
             )  # fmt: skip
-        self.took_s = time.monotonic() - start_s
-        self._evaluated_at, self.latest = step, {"step": step, **report}
         self._drawn = drawn
         self._film = camera.films[0] if camera is not None else None
+        return report
 
     def _check_target(self) -> None:
         target = self._settings.stop_when

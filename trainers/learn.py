@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import socket
 import sys
@@ -14,7 +15,7 @@ from types import FrameType
 from typing import Any
 
 from trainers.common import process, stopping
-from trainers.common.command import DONE, INTERRUPTED, TERMINATED, tells_failures
+from trainers.common.command import DONE, FAILED, INTERRUPTED, TERMINATED, tells_failures
 from trainers.common.options import add_results_option, command_parser, version
 
 ASKING_TO_STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -27,14 +28,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     process.prepare()
     # Imported late, so that `--help` and a mistyped option answer at once.
     # And so does the line that says that something happens.
-    print(f"{version()}: {options.config}", flush=True)
+    if _is_first():
+        print(f"{version()}: {options.config}", flush=True)
+    from trainers.distributed.processes import connected  # noqa: PLC0415
+    from trainers.distributed.world import RankFailure  # noqa: PLC0415
     from trainers.run import check_file, run_file  # noqa: PLC0415
 
-    with stop_on_signals() as stop:
+    with stop_on_signals() as stop, connected() as world:
         try:
-            finished = (check_file if options.check else run_file)(options, stop.requested)
+            if options.check:
+                finished = check_file(options, stop.requested)
+            else:
+                finished = run_file(options, stop.requested, world)
         except KeyboardInterrupt:
             return stop.exit_code
+        except RankFailure:
+            if world.writes:
+                raise
+            return FAILED  # as the first and the one that failed tell
     return DONE if finished else stop.exit_code
 
 
@@ -87,10 +98,15 @@ class Stop:
         The first sets an alarm, too, for an environment that does not return; again and again, as
         an environment may be called without a question whether to stop, or swallow the alarm.
 
+        Under torchrun none insists: it passes on what its processes got already, and kills those
+        that do not end.
+
         Raises:
             KeyboardInterrupt: it is the second.
         """
         if self.requested():
+            if "TORCHELASTIC_RUN_ID" in os.environ:
+                return
             raise KeyboardInterrupt
         self.exit_code = INTERRUPTED if number == signal.SIGINT else TERMINATED
         signal.setitimer(signal.ITIMER_REAL, stopping.PATIENCE_S, 1.0)
@@ -134,10 +150,15 @@ def _answered() -> Iterator[None]:
         heard.close()
 
 
+def _is_first() -> bool:
+    """Whether it is this one that speaks, of the processes that torchrun started."""
+    return os.environ.get("RANK", "0") == "0"
+
+
 def _answer(heard: socket.socket) -> None:
     """Answers the first request to stop among the signals, whose numbers come in as bytes."""
     while number := heard.recv(1):
-        if number[0] in ASKING_TO_STOP:
+        if number[0] in ASKING_TO_STOP and _is_first():
             name = signal.Signals(number[0]).name
             print(f"{name}: stopping, and saving first; once more stops at once", file=sys.stderr)
             return

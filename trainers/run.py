@@ -7,7 +7,7 @@ import json
 import logging
 import shlex
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from pathlib import Path
 
 import torch
@@ -23,10 +23,12 @@ from trainers.common.files import write_atomically
 from trainers.common.origin import blaming_plugins
 from trainers.common.stopping import StopRequested
 from trainers.common.timers import Timer, recording
+from trainers.distributed.processes import restarts
+from trainers.distributed.world import ALONE, World
 from trainers.held_out import HeldOutEvaluation
 from trainers.inference.construction import check_weights, load_weights
 from trainers.inference.metadata import FILE as METADATA
-from trainers.reporting.event_log import LoggerChoice, RunLog
+from trainers.reporting.event_log import RunLog
 from trainers.reporting.overview import (
     aligned,
     memory,
@@ -37,6 +39,7 @@ from trainers.reporting.overview import (
     spaces,
 )
 from trainers.reporting.pace import Pace
+from trainers.reporting.silent import SilentLog
 from trainers.reporting.summary import Summary
 from trainers.reporting.terminal import make_display
 from trainers.runfile.changes import changeable, changes
@@ -50,6 +53,7 @@ from trainers.saving.run_folder import (
     begin,
     claim,
     find_checkpoint,
+    has_checkpoints,
     run_name,
 )
 from trainers.saving.serialization import mismatch
@@ -61,12 +65,15 @@ TIMERS = "timers.json"
 _logger = logging.getLogger("ventosa")
 
 
-def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) -> bool:
+def run_file(
+    options: argparse.Namespace, stop_requested: Callable[[], bool], world: World = ALONE
+) -> bool:
     """Trains as the command line asks for.
 
     Args:
         options: as `trainers.learn.parse` returns them.
         stop_requested: asked before every step of the environments.
+        world: the processes that run it together.
 
     Returns:
         Whether the run is finished; False if it was stopped and saved.
@@ -75,23 +82,30 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
         UserError: the user's mistake.
         Exception: the run can't go on; a note names its last checkpoint.
     """
-    run, registries = _load_run(options)
+    with world.together():
+        run, registries = _load_run(options)
+    world.check_same(f"the run file {options.config}", dump_yaml(run))
     settings = run.trainer.settings
     assert isinstance(settings, TrainerSettings)  # the registry sees to it
     run_id = run_name(options.config.stem if options.run_id is None else options.run_id)
     directory = options.results_dir / run_id
     checkpoints = Checkpoints(directory / CHECKPOINTS, settings.keep_checkpoints)
+    options = _after_restart(options, directory)
     with ExitStack() as stack:
         compilation = stack.enter_context(telling_of_compilation(_tell))
-        lock = claim(directory, resume=options.resume, force=options.force)
-        stack.enter_context(closing(lock))
-        resumed = checkpoints.load_latest() if options.resume else None
-        if resumed is not None:
-            _check_unchanged(directory, run, registries)
-        session = stack.enter_context(closing(Session(run, registries, stop_requested)))
+        resumed = None
+        with world.together():
+            if world.writes:
+                lock = claim(directory, resume=options.resume, force=options.force)
+                stack.enter_context(closing(lock))
+                resumed = _resumed(options, directory, checkpoints, run, registries)
+        resumed = world.first(resumed)
+        with world.together():
+            session = stack.enter_context(closing(Session(run, registries, stop_requested, world)))
         try:
             # Nothing is replaced before it is certain that the run can begin.
-            notes = _start(session, options, resumed)
+            with world.together():
+                notes = _start(session, options, resumed)
             start = session.env_runner.step_count
             held_out = stack.enter_context(_held_out(session, run, start, stop_requested))
         except StopRequested:
@@ -99,8 +113,10 @@ def run_file(options: argparse.Namespace, stop_requested: Callable[[], bool]) ->
         if resumed is not None and (reason := _finished(resumed, settings, held_out)):
             print(f"{run_id}: finished already, at step {start} ({reason}): raise that to go on")
             return True
-        files = {CONFIGURATION: dump_yaml(run), METADATA: session.metadata.to_json()}
-        begin(directory, files, resume=options.resume)
+        with world.together():
+            if world.writes:
+                files = {CONFIGURATION: dump_yaml(run), METADATA: session.metadata.to_json()}
+                begin(directory, files, resume=options.resume)
         _tell(*_banner(run, session, directory))
         pace = _pace(run, settings, start, held_out, compilation)
         ending = _learn(run, session, checkpoints, held_out, resumed, notes, pace)
@@ -122,11 +138,11 @@ def _learn(
     settings, start = run.trainer.settings, session.env_runner.step_count
     assert isinstance(settings, TrainerSettings)
     directory = checkpoints.directory.parent
-    run_id = directory.name
+    run_id, writes = directory.name, session.world.writes
     with (
-        closing(RunLog(directory, start if resumed else None, _loggers(run))) as log,
+        closing(_log(run, directory, start if resumed else None, writes)) as log,
         make_display(run_id, settings.max_steps, session.lesson_count, start) as display,
-        _timers_written(directory),
+        _timers_written(directory) if writes else nullcontext(),
     ):
         log.text("configuration", f"```yaml\n{dump_yaml(run)}```", start)
         for note in notes:
@@ -245,8 +261,39 @@ def _pace(
     return Pace(start, settings.max_steps, run.evaluation.interval, evaluation_s)
 
 
-def _loggers(run: RunSettings) -> dict[str, LoggerChoice]:
-    return {logger.name: (logger.cls, logger.settings) for logger in run.loggers}
+def _log(run: RunSettings, directory: Path, start: int | None, writes: bool) -> RunLog:
+    if not writes:
+        return SilentLog()
+    loggers = {logger.name: (logger.cls, logger.settings) for logger in run.loggers}
+    return RunLog(directory, start, loggers)
+
+
+def _after_restart(options: argparse.Namespace, directory: Path) -> argparse.Namespace:
+    """The command line of a run that torchrun has started again: it goes on where it was saved."""
+    if not restarts():
+        return options
+    saved = has_checkpoints(directory)
+    again = {"resume": True, "force": False, "initialize_from": None}
+    return argparse.Namespace(**vars(options) | (again if saved else {"force": True}))
+
+
+def _resumed(
+    options: argparse.Namespace,
+    directory: Path,
+    checkpoints: Checkpoints,
+    run: RunSettings,
+    registries: Registries,
+) -> Loaded | None:
+    """The checkpoint to go on from; None where the run begins.
+
+    Raises:
+        UserError: there is none, or it is another run's.
+    """
+    if not options.resume:
+        return None
+    resumed = checkpoints.load_latest()
+    _check_unchanged(directory, run, registries)
+    return resumed
 
 
 @contextmanager
@@ -392,7 +439,7 @@ def _load(session: Session, resumed: Loaded) -> None:
         ValueError: the state is not of the session's kind, or of another step than it is said to
             be; whatever else a state leads to that is of the right kind, and doesn't fit.
     """
-    state, scoring = resumed.state, Averager()
+    state, scoring = session.own_state(resumed.state), Averager()
     own = {"step": 0, SCORING: scoring.state_dict(), **session.state_dict()}
     weights = session.algorithm.policy.current_weights(resumed.weights)
     if wrong := mismatch(state, own) or mismatch(weights, session.weights(), "weights"):

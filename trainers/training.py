@@ -134,7 +134,8 @@ class Training:
             self._save(good)
             raise
         except (Exception, SystemExit) as error:
-            if good is not None:
+            # Ranks save together, or not at all.
+            if good is not None and self._session.world.all_know(error):
                 self._save_after(error, good)
             raise
 
@@ -189,7 +190,7 @@ class Training:
     def _endless_from(self) -> float:
         """Steps of an episode that may have no end: a third of what an environment takes in all."""
         least, most = ENDLESS_STEPS
-        third = self._settings.max_steps / self._session.env_runner.env.num_envs / 3
+        third = self._settings.max_steps / self._session.env_runner.num_envs / 3
         return max(least, min(most, third))
 
     def _evaluate(self, step: int) -> bool:
@@ -216,11 +217,15 @@ class Training:
             raise NonFiniteError(f"step {step}: the weights {min(broken)!r} are not finite")
         if interval_over:
             self._since_save = Averager()
+        session = self._session
         with timed("checkpoint"):
-            state = {"step": step, SCORING: self._since_save.state_dict(), **good.state}
-            path = self._checkpoints.save(step, good.weights, state, score, score_of)
+            joined = session.joined_state(good.state)
+            state = {"step": step, SCORING: self._since_save.state_dict(), **joined}
+            with session.world.together():
+                if session.world.writes:
+                    path = self._checkpoints.save(step, good.weights, state, score, score_of)
+                    self._summary.note_checkpoint(path)
         self._saved_step, self._saved_score = step, score
-        self._summary.note_checkpoint(path)
 
     def _score(self, step: int) -> tuple[float | None, str]:
         """Score that the best checkpoint is chosen by, if it has one, and what it is a score of.

@@ -7,8 +7,9 @@ import os
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from datetime import timedelta
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -98,10 +99,13 @@ def connected() -> Iterator[World]:
     _connect()
     try:
         world = Processes()
-        if not world.writes:
-            # What all of them warn of is told once.
-            logging.getLogger("ventosa").setLevel(logging.ERROR)
-        yield world
+        if world.writes:
+            yield world
+            return
+        # What all of them would tell, and warn of, is told once.
+        logging.getLogger("ventosa").setLevel(logging.ERROR)
+        with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+            yield world
     finally:
         if dist.is_initialized():
             dist.destroy_process_group()
