@@ -80,7 +80,8 @@ def test_it_has_the_run_files_and_the_policies(wheel: Path) -> None:
 def test_init_finds_them_there(ventosa: Callable[..., str]) -> None:
     assert ventosa("--version") == f"ventosa {version('ventosa')}\n"
     assert "policies/grasp_gaussian" in ventosa("init")
-    assert ventosa("init", "paper/lstm") == "paper/lstm.yaml\npaper/curriculum.yaml\n"
+    copied = "paper/lstm.yaml\npaper/curriculum.yaml\nschema.json\n"
+    assert ventosa("init", "paper/lstm") == copied
 
 
 @pytest.mark.soak

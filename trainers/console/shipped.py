@@ -15,6 +15,8 @@ CONFIG, POLICIES = "config", "policies"
 SENTINEL = f"{CONFIG}/run.yaml"
 NAMED_FILES = ("extends", "run")
 """Keys by which a run file names its base, and a sweep its run file, as seen from itself."""
+MODELINE = "# yaml-language-server: $schema="
+"""In a run file's first line, before the schema that editors check it by, as seen from it."""
 
 
 def shipped_folder() -> Path:
@@ -48,12 +50,16 @@ def policies(folder: Path) -> dict[str, Path]:
 
 
 def with_named_files(path: Path) -> Iterator[Path]:
-    """A run file, and those that it takes to read it."""
+    """A run file, those that it takes to read it, and last the schemas of them all."""
     yield path
-    content = yaml.safe_load(path.read_bytes())
+    text = path.read_text("utf-8")
+    content = yaml.safe_load(text)
     for key in NAMED_FILES:
         if key in content:
             yield from with_named_files((path.parent / content[key]).resolve())
+    first = text.partition("\n")[0]
+    if first.startswith(MODELINE):
+        yield (path.parent / first.removeprefix(MODELINE)).resolve()
 
 
 def title(path: Path) -> str:

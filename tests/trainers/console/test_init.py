@@ -41,12 +41,10 @@ def test_a_run_file_comes_with_those_it_extends(
     here: Path, capsys: pytest.CaptureFixture[str], registries: Registries
 ) -> None:
     assert main(["paper/lstm", "mine"]) == DONE
-    assert capsys.readouterr().out == "mine/paper/lstm.yaml\nmine/paper/curriculum.yaml\n"
+    names = ("paper/lstm.yaml", "paper/curriculum.yaml", "schema.json")
+    assert capsys.readouterr().out == "".join(f"mine/{name}\n" for name in names)
     config = HOME / "config"
-    assert files(here) == {
-        f"mine/paper/{name}.yaml": (config / f"paper/{name}.yaml").read_bytes()
-        for name in ("lstm", "curriculum")
-    }
+    assert files(here) == {f"mine/{name}": (config / name).read_bytes() for name in names}
     copied = load_run(here / "mine/paper/lstm.yaml", [], registries)
     assert copied == load_run(config / "paper/lstm.yaml", [], registries)
 
@@ -60,7 +58,8 @@ def test_whatever_a_run_file_names_is_under_config(name: str) -> None:
 
 def test_a_sweep_comes_with_its_run_file(here: Path) -> None:
     assert main(["sweeps/cartpole.yaml"]) == DONE
-    assert set(files(here)) == {"sweeps/cartpole.yaml", "gymnasium/cartpole_ppo.yaml"}
+    ours = {"sweeps/cartpole.yaml", "gymnasium/cartpole_ppo.yaml"}
+    assert set(files(here)) == ours | {"schema.json", "sweeps/schema.json"}
 
 
 def test_a_policy_is_copied_whole(here: Path) -> None:
