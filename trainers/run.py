@@ -17,7 +17,6 @@ from envs.memory import adding_up, machine_bytes
 from trainers.algorithms.base import TrainerSettings
 from trainers.common.averager import Averager
 from trainers.common.command import told
-from trainers.common.compilation import Compilation, telling_of_compilation
 from trainers.common.errors import UserError, first_lines
 from trainers.common.files import write_atomically
 from trainers.common.origin import blaming_plugins
@@ -28,6 +27,7 @@ from trainers.distributed.world import ALONE, World
 from trainers.held_out import HeldOutEvaluation
 from trainers.inference.construction import check_weights, load_weights
 from trainers.inference.metadata import FILE as METADATA
+from trainers.reporting.compilation import Compilation, telling_of_compilation
 from trainers.reporting.event_log import RunLog
 from trainers.reporting.overview import (
     aligned,

@@ -607,7 +607,7 @@ def test_weights_that_are_not_finite_are_not_saved(
     def overflowing(run_fraction: float) -> Any:
         statistics = update(run_fraction)
         if one.steps == 32:
-            next(algorithm.policy.parameters()).data.fill_(np.inf)
+            algorithm.policy.action_model.log_std.data.fill_(np.inf)
         return statistics
 
     monkeypatch.setattr(algorithm, "update", overflowing)

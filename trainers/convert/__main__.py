@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from trainers.common.command import DONE, tells_failures
+from trainers.common.options import command_parser
 
 
 @tells_failures
@@ -23,8 +24,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m trainers.convert",
+    parser = command_parser(
+        "convert",
         description="Make a run file of a trainer configuration of ML-Agents, and print it.",
     )
     parser.add_argument("config", type=Path, metavar="FILE", help="the trainer configuration")

@@ -20,6 +20,7 @@ COST_NOTHING = {
     *("summary_freq", "checkpoint_interval", "keep_checkpoints", "interval"),
     *("episode_steps", "max_episode_steps", "sequence_length"),
     *("smoothing_episodes", "min_lesson_length", "every"),
+    *("max_lifetime_restarts", "restarts_rate_limit_n"),
 }
 """Are only counted up to, or divided by."""
 CHECKED_TOGETHER = {"crop", "things", "patch", "layers"}

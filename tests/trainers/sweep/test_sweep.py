@@ -49,7 +49,7 @@ class InProcess:
 
     def __call__(self, command: Sequence[str], job: Job) -> Ended:
         self.commands.append(command)
-        options = learn.parse(command[2:])
+        options = learn.parse(command[3:])
         stopped, asked = False, 0
 
         def stop() -> bool:
@@ -212,7 +212,7 @@ def test_what_does_badly_is_pruned_and_can_be_gone_on_with(
     assert status["state"] == "interrupted"
     assert 128 <= status["step"] < 384
     assert f"| pruned: reward {pruned.value:.4g} |" in Path("results/pole/report.md").read_text()
-    command = [word for word in runs.commands[-1][2:] if word not in ("--resume", "--force")]
+    command = [word for word in runs.commands[-1][3:] if word not in ("--resume", "--force")]
     assert run_file(learn.parse([*command, "--resume"]), lambda: False)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numba
 
-from trainers.common.compilation import NOTICE, telling_of_compilation
+from trainers.reporting.compilation import NOTICE, telling_of_compilation
 
 
 def test_it_is_told_once() -> None:
