@@ -19,7 +19,9 @@ from trainers.algorithms.captured import Captured
 from trainers.algorithms.optimization import (
     adam,
     check_finite,
+    load_generator,
     load_optimizer,
+    optimizer_state,
     optimizer_step,
     set_learning_rates,
 )
@@ -333,7 +335,10 @@ class OffPolicyAlgorithm(ABC):
         """See `Algorithm.state_dict`."""
         saved = self._hyperparameters.save_replay_buffer
         return {
-            **{f"{name}_optimizer": each.state_dict() for name, each in self._optimizers.items()},
+            **{
+                f"{name}_optimizer": optimizer_state(each)
+                for name, each in self._optimizers.items()
+            },
             "generator": self._generator.get_state(),
             "due": self._pending_updates,  # checkpoints have always called it so
             "replay_buffer": self._buffer.state_dict() if saved else None,
@@ -346,6 +351,6 @@ class OffPolicyAlgorithm(ABC):
         self.policy.load_state_dict(weights)
         for name, optimizer in self._optimizers.items():
             load_optimizer(optimizer, state[f"{name}_optimizer"])
-        self._generator.set_state(state["generator"])
+        load_generator(self._generator, state["generator"])
         self._pending_updates = state["due"]
         self._improve = self._captured()

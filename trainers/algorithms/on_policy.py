@@ -11,7 +11,13 @@ from gymnasium.spaces import Box
 from pydantic import BaseModel, Field, model_validator
 from torch import Tensor, nn
 
-from trainers.algorithms.optimization import adam, load_optimizer, optimizer_step
+from trainers.algorithms.optimization import (
+    adam,
+    load_generator,
+    load_optimizer,
+    optimizer_state,
+    optimizer_step,
+)
 from trainers.algorithms.schedules import LINEAR, Schedule
 from trainers.common.errors import UserError
 from trainers.experience.env_runner import EnvRunner
@@ -132,7 +138,7 @@ class OnPolicyAlgorithm:
     def state_dict(self) -> dict[str, Any]:
         """See `Algorithm.state_dict`."""
         return {
-            "optimizer": self._optimizer.state_dict(),
+            "optimizer": optimizer_state(self._optimizer),
             "collector": self._collector.state_dict(),
             "generator": self._generator.get_state(),
         }
@@ -142,7 +148,7 @@ class OnPolicyAlgorithm:
         self.policy.load_state_dict(weights)
         load_optimizer(self._optimizer, state["optimizer"])
         self._collector.load_state_dict(state["collector"])
-        self._generator.set_state(state["generator"])
+        load_generator(self._generator, state["generator"])
 
     def _pop_rollout(self) -> Rollout:
         """The experience of the last collection, for one update alone."""

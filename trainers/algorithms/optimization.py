@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -10,6 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from trainers.common.errors import NonFiniteError
+
+GENERATOR_BYTES = {16, 5056}
+"""Sizes of a generator's state on a GPU and on the CPU."""
 
 Mean = Callable[[Sequence[Tensor]], Sequence[Tensor]]
 """From what one process has to what all processes of a run have on average."""
@@ -95,6 +99,28 @@ def _laid_out_as(parameter: nn.Parameter, gradient: Tensor) -> Tensor:
     if gradient.stride() == parameter.stride():
         return gradient
     return torch.empty_like(parameter, requires_grad=False).copy_(gradient)
+
+
+def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+    """An optimizer's state, of the same kinds on every device."""
+    state = optimizer.state_dict()
+    for group in state["param_groups"]:
+        group["lr"] = float(group["lr"])
+    return state
+
+
+def load_generator(generator: torch.Generator, state: Tensor) -> None:
+    """Takes a generator back to a state; one of another kind of device is a seed instead.
+
+    Raises:
+        RuntimeError: it is neither.
+    """
+    sizes = {len(state), len(generator.get_state())}
+    if sizes == GENERATOR_BYTES:
+        digest = hashlib.sha256(state.cpu().numpy().tobytes()).digest()
+        generator.manual_seed(int.from_bytes(digest[:7], "big"))
+    else:
+        generator.set_state(state)
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:

@@ -9,7 +9,9 @@ from torch import nn
 from trainers.algorithms.optimization import (
     adam,
     check_finite,
+    load_generator,
     load_optimizer,
+    optimizer_state,
     optimizer_step,
     set_learning_rates,
 )
@@ -106,3 +108,25 @@ def test_each_weight_of_a_convolution_goes_down_its_own_gradient() -> None:
     optimizer = torch.optim.SGD([convolution.weight], lr=1.0, fused=True)
     optimizer_step(optimizer, loss, [convolution.weight], INFINITE)
     assert torch.equal(convolution.weight, before - gradient)
+
+
+def test_a_generator_goes_on_where_it_was_and_that_of_another_device_is_a_seed() -> None:
+    generator, other = torch.Generator().manual_seed(3), torch.Generator()
+    load_generator(other, generator.get_state())
+    assert torch.equal(torch.rand(5, generator=generator), torch.rand(5, generator=other))
+    of_a_gpu = torch.arange(16, dtype=torch.uint8)
+    drawn = []
+    for seed in (1, 2):
+        generator.manual_seed(seed)
+        load_generator(generator, of_a_gpu)
+        drawn.append(torch.rand(5, generator=generator).tolist())
+    assert drawn[0] == drawn[1]
+    with pytest.raises(RuntimeError):
+        load_generator(generator, torch.zeros(17, dtype=torch.uint8))
+
+
+def test_an_optimizer_s_state_is_of_the_same_kinds_on_every_device() -> None:
+    optimizer = stepped_adam(2)
+    optimizer.param_groups[0]["lr"] = torch.tensor(0.25)  # as it is on a GPU
+    assert optimizer_state(optimizer)["param_groups"][0]["lr"] == 0.25
+    assert isinstance(optimizer.param_groups[0]["lr"], torch.Tensor)
