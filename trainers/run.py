@@ -213,7 +213,7 @@ def _banner(run: RunSettings, session: Session, directory: Path) -> list[str]:
     """What is trained, on what, and where to watch it."""
     return aligned(
         {
-            "environment": f"{run.environment.name}, {session.env_runner.env.num_envs} in parallel",
+            "environment": f"{run.environment.name}, {session.env_runner.num_envs} in parallel",
             "trainer": run.trainer.name,
             "parameters": f"{parameter_count(session.algorithm.policy):,}",
             "device": f"{run.device}, {torch.get_num_threads()} threads",
