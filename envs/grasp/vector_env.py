@@ -227,8 +227,13 @@ class GraspVectorEnv(Environment):
         """See `Environment.load_state_dict`.
 
         Raises:
-            ValueError: the state is of another task.
+            ValueError: the state is of another task, or of one process alone.
         """
+        if self._first and state.get("streams") is None:
+            raise ValueError(
+                "its environments draw from one generator, as they did before they were numbered "
+                "through, and several processes would draw the same: go on in one"
+            )
         episodes = RunningEpisodes.from_state_dict(state, self._settings.cameras)
         self._arm.check(episodes.tools)
         self._sampler.check(episodes.scenes)

@@ -70,3 +70,12 @@ def test_a_share_of_grasp_environments_lives_as_it_does_among_all() -> None:
     other.load_state_dict(part.state_dict())
     restored, went_on = (env.step(actions[0, 2:])[0]["depth"] for env in (other, part))
     assert np.array_equal(restored, went_on)
+
+
+def test_a_state_without_streams_is_of_one_process_alone() -> None:
+    alone, later = make(2, 0), make(2, 2)
+    alone.reset()
+    state = {**alone.state_dict(), "streams": None}
+    alone.load_state_dict(state)
+    with pytest.raises(ValueError, match=r"several processes would draw the same: go on in one$"):
+        later.load_state_dict(state)
