@@ -205,12 +205,7 @@ class StackedEpisodes(RepeatableEpisodes):
     that would be before it.
 
     Args:
-        env: the environment.
-        name: for messages.
-        run_seed: of the run.
-        index: which of the run's environments it is, from 0.
-        frame_stack: how many observations.
-        with_infos: see `RepeatableEpisodes`.
+        frame_stack: how many observations; the others are those of `RepeatableEpisodes`.
     """
 
     def __init__(

@@ -83,7 +83,7 @@ class GymEnvironment(Environment):
         self.name, self._seed = settings.id, seed
         self.num_envs = settings.num_envs
         self._begun = np.zeros(self.num_envs, np.int64)
-        self._parameters: dict[str, ParameterValue] = {}
+        self._first, self._parameters = 0, dict[str, ParameterValue]()
         self._vector = make_vector_env(
             settings, seed, with_infos=bool(rewards), prepare=self._next_episodes
         )
@@ -118,6 +118,7 @@ class GymEnvironment(Environment):
 
     def number_from(self, first: int) -> None:
         """See `Environment.number_from`."""
+        self._first = first
         self._call("number_from", first)
 
     def reset(
@@ -262,6 +263,7 @@ class GymEnvironment(Environment):
     def _next_episodes(self) -> list[Message]:
         """What an environment that was started again is asked, to go on with its next episode."""
         return [
+            ("number_from", (self._first,)),
             ("count_from", (self._seed, self._begun)),
             ("set_parameters", (self._parameters,)),
         ]

@@ -257,6 +257,17 @@ def test_an_episode_whose_process_was_lost_is_cut_off_where_it_was_seen_last() -
             assert_same(env.step(now), other.step(now))
 
 
+def test_an_environment_that_is_started_again_has_its_number_in_the_run() -> None:
+    with closing(make(count=2, vectorization="async")) as env:
+        env.number_from(3)
+        env.reset()
+        begun = int(env._begun[1])
+        lose(env, 1)
+        observations = env.step(actions_for(env, 1)[0])[0]
+        room, _ = Room().reset(seed=episode_seed(7, 3 + 1, begun))
+        np.testing.assert_array_equal(observations["view"][1], room["view"])
+
+
 def test_a_first_episode_whose_process_was_lost_begins_again() -> None:
     with closing(make(count=2, vectorization="async")) as env, closing(make(count=2)) as other:
         lose(env, 0)
