@@ -119,7 +119,7 @@ class ReplayBuffer:
         """
         here = self._row_indices(self._row)
         if not self._length:
-            self._frame[here] = self._frames.add(observations, np.arange(self._num_envs))
+            self._keep_frames(here, self._frames.add(observations, np.arange(self._num_envs)))
             self._keep_vectors(here, observations)
         self._actions[here] = torch.from_numpy(actions)
         self._rewards[here] = torch.from_numpy(step.reward)
@@ -134,11 +134,9 @@ class ReplayBuffer:
         else:
             self._length += 1
         self._keep_vectors(there, next_observations)
-        new = np.flatnonzero(~step.same_frame)
-        self._frame[there] = self._frame[here]
-        self._frame[there][new] = self._frames.add(next_observations, new)
-        for rows in (here, there):
-            self._frame_slots[rows] = torch.from_numpy(self._frame[rows])
+        new, frame = np.flatnonzero(~step.same_frame), self._frame[here].copy()
+        frame[new] = self._frames.add(next_observations, new)
+        self._keep_frames(there, frame)
         self._final_slots[here] = torch.from_numpy(self._final[here])
 
     def sample(
@@ -259,6 +257,10 @@ class ReplayBuffer:
     def _after(self, indices: Tensor) -> Tensor:
         """Indices of the next row."""
         return (indices + self._num_envs) % len(self._rewards)
+
+    def _keep_frames(self, indices: slice, slots: NDArray[np.int64]) -> None:
+        self._frame[indices] = slots
+        self._frame_slots[indices] = torch.from_numpy(slots)
 
     def _keep_vectors(self, indices: slice, observations: Mapping[str, NDArray[Any]]) -> None:
         for name, values in self._vectors.items():
