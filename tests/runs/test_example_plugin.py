@@ -6,8 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
-import sysconfig
-import venv
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -36,17 +35,12 @@ def run(python: Path, *arguments: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def python(
+    tmp_path_factory: pytest.TempPathFactory, borrowing_venv: Callable[[Path], Path]
+) -> Path:
     """Make a virtual environment with the example, which borrows all else from this one."""
     folder = tmp_path_factory.mktemp("plugin")
-    home = folder / "venv"
-    venv.create(home)
-    paths = {"base": str(home), "platbase": str(home)}
-    borrowed = Path(sysconfig.get_path("purelib", "venv", vars=paths)) / "borrowed.pth"
-    borrowed.write_text("\n".join({sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}))
-    interpreter = (
-        Path(sysconfig.get_path("scripts", "venv", vars=paths)) / Path(sys.executable).name
-    )
+    interpreter = borrowing_venv(folder / "venv") / Path(sys.executable).name
     # A copy: building leaves files beside the sources.
     source = shutil.copytree(EXAMPLE, folder / "source")
     options = ("--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check")

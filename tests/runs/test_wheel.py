@@ -6,8 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-import sysconfig
-import venv
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
@@ -51,14 +49,14 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def ventosa(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
+def ventosa(
+    wheel: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    borrowing_venv: Callable[[Path], Path],
+) -> Callable[..., str]:
     """Runs `ventosa` in an empty folder but for `envs/`, which is the user's, and a module."""
     home, here = tmp_path_factory.mktemp("venv"), tmp_path_factory.mktemp("here")
-    venv.create(home)
-    paths = {"base": str(home), "platbase": str(home)}
-    borrowed = Path(sysconfig.get_path("purelib", "venv", vars=paths)) / "borrowed.pth"
-    borrowed.write_text("\n".join({sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}))
-    scripts = Path(sysconfig.get_path("scripts", "venv", vars=paths))
+    scripts = borrowing_venv(home)
     options = ("--no-deps", "--no-index", "--disable-pip-version-check", "--quiet")
     run([scripts / "python", "-m", "pip", "install", *options, wheel], home)
     (here / "envs").mkdir()

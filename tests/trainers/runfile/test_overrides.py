@@ -25,14 +25,20 @@ def load(registries: Registries, *overrides: str, config: str = "run.yaml") -> d
     return resolved(load_run(CONFIG / config, overrides, registries))
 
 
+def with_conv(folder: Path, more: str = "") -> Path:
+    """A run file with an encoder `conv`, and more of its settings."""
+    config = folder / "own.yaml"
+    config.write_text(
+        f"extends: {CONFIG / 'gymnasium/cartpole_ppo.yaml'}\n"
+        f"encoders: {{eye: {{type: conv, layers: [[8, 8, 4]]{more}}}}}\n"
+    )
+    return config
+
+
 def test_another_encoder_has_none_of_the_old_one_s_keys(
     registries: Registries, told: list[str], tmp_path: Path
 ) -> None:
-    config = tmp_path / "own.yaml"
-    config.write_text(
-        f"extends: {CONFIG / 'gymnasium/cartpole_ppo.yaml'}\n"
-        "encoders: {eye: {type: conv, layers: [[8, 8, 4]], activation: relu}}\n"
-    )
+    config = with_conv(tmp_path, ", activation: relu")
     run = resolved(load_run(config, ["encoders.eye.type=simple"], registries))
     assert run["encoders"]["eye"]["type"] == "simple"
     assert told == [
@@ -74,11 +80,7 @@ def test_a_part_within_a_component(registries: Registries, told: list[str]) -> N
 def test_what_the_command_line_says_itself_is_not_left_out(
     registries: Registries, told: list[str], tmp_path: Path
 ) -> None:
-    config = tmp_path / "own.yaml"
-    config.write_text(
-        f"extends: {CONFIG / 'gymnasium/cartpole_ppo.yaml'}\n"
-        "encoders: {eye: {type: conv, layers: [[8, 8, 4]]}}\n"
-    )
+    config = with_conv(tmp_path)
     given = ["encoders.eye.channels=3", "encoders.eye.type=simple"]
     with pytest.raises(SettingsError, match=r"encoders\.eye\.channels: unknown key"):
         load_run(config, given, registries)
