@@ -19,8 +19,9 @@ WriteRun = Callable[..., Path]
 INTERVAL_S = 2.0
 WARM = 0.3
 """Part of the run after which nothing grows."""
-GROWTH = {"memory_mib": 16.0, "descriptors": 2, "files": 8, "checkpoint_bytes": 2**16}
-"""What comes and goes: a file that is written, a checkpoint, episodes that wait."""
+GROWTH = {"memory_mib": 16.0, "descriptors": 2, "files": 9, "checkpoint_bytes": 2**16}
+"""What comes and goes: files of a checkpoint that is written (4), of the best one where that is
+older than the kept ones (4), the policy's description; episodes that wait."""
 
 ENDLESS = """
 import gymnasium
