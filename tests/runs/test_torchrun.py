@@ -130,5 +130,5 @@ def test_sigterm_stops_all_ranks_and_saves_once(run_path: Path) -> None:
         time.sleep(0.1)
     process.terminate()
     output, _ = process.communicate(timeout=TIMEOUT_S)
-    assert output.count("stopped and saved") == 1
+    assert output.count("stopped, and saved") == 1
     assert status(folder)["state"] == "interrupted"
