@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from curricula.samplers import ParameterValue
 from envs.grasp.sensors.structured_light import MAX_STRENGTH
-from envs.grasp.settings import MAX_NOISE_SIGMA_M, GraspSettings
+from envs.grasp.settings import MAX_GOAL_DEG, MAX_GOAL_M, MAX_NOISE_SIGMA_M, GraspSettings
 
 GOAL_PARAMETERS = ("lateral_limit_m", "vertical_limit_m", "gap_limit_m", "yaw_limit_deg")
 SENSOR_PARAMETERS = ("noise_sigma_m", "missing_fraction", "sensor_strength")
@@ -52,16 +52,20 @@ class ParameterRange:
 def parameter_ranges(settings: GraspSettings) -> dict[str, ParameterRange]:
     """The ranges of all environment parameters, by name."""
     gap_min_m = settings.goal.gap_min_m
-    positive = ParameterRange(_over(0.0), math.inf, "a limit is over 0")
+    limit_m, limit_deg = (
+        ParameterRange(_over(0.0), most, f"a limit is over 0 and at most {most:g} {unit}")
+        for most, unit in ((MAX_GOAL_M, "m"), (MAX_GOAL_DEG, "deg"))
+    )
     return {
-        "lateral_limit_m": positive,
-        "vertical_limit_m": positive,
+        "lateral_limit_m": limit_m,
+        "vertical_limit_m": limit_m,
         "gap_limit_m": ParameterRange(
             _over(gap_min_m),
-            math.inf,
-            f"the largest gap is over the smallest one, {gap_min_m:g} (environment.goal.gap_min_m)",
+            MAX_GOAL_M,
+            f"the largest gap is over the smallest one, {gap_min_m:g} "
+            f"(environment.goal.gap_min_m), and at most {MAX_GOAL_M:g} m",
         ),
-        "yaw_limit_deg": positive,
+        "yaw_limit_deg": limit_deg,
         "noise_sigma_m": ParameterRange(
             0.0, MAX_NOISE_SIGMA_M, f"a sigma is within 0 and {MAX_NOISE_SIGMA_M:g} m"
         ),

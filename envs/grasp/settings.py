@@ -20,6 +20,7 @@ from envs.grasp.sensors.structured_light import Gaussian, StructuredLight
 MIN_CONTACT_RESOLUTION_M = 1e-6
 # Well under the thinnest bar of a block, so that nothing is passed through.
 MAX_CONTACT_RESOLUTION_M = 0.02
+MAX_GOAL_M, MAX_GOAL_DEG = 100.0, 360.0
 MAX_NOISE_SIGMA_M = 1.0
 # About as far as the arm can go straight ahead at all.
 MAX_STANDOFF_M = 1.0
@@ -310,11 +311,21 @@ class Randomize(BaseModel, frozen=True, extra="forbid"):
 class Goal(BaseModel, frozen=True, extra="forbid"):
     """The goal region in the block frame; also the environment parameters lessons set."""
 
-    lateral_limit_m: float = Field(0.01, gt=0.0, description="Lateral x within +- this.")
-    vertical_limit_m: float = Field(0.01, gt=0.0, description="Vertical y within +- this.")
-    gap_min_m: float = Field(0.01, ge=0.0, description="Smallest gap z from cup to face.")
-    gap_limit_m: float = Field(0.02, gt=0.0, description="Largest gap z from cup to face.")
-    yaw_limit_deg: float = Field(2.0, gt=0.0, description="Yaw error within +- this.")
+    lateral_limit_m: float = Field(
+        0.01, gt=0.0, le=MAX_GOAL_M, description="Lateral x within +- this."
+    )
+    vertical_limit_m: float = Field(
+        0.01, gt=0.0, le=MAX_GOAL_M, description="Vertical y within +- this."
+    )
+    gap_min_m: float = Field(
+        0.01, ge=0.0, le=MAX_GOAL_M, description="Smallest gap z from cup to face."
+    )
+    gap_limit_m: float = Field(
+        0.02, gt=0.0, le=MAX_GOAL_M, description="Largest gap z from cup to face."
+    )
+    yaw_limit_deg: float = Field(
+        2.0, gt=0.0, le=MAX_GOAL_DEG, description="Yaw error within +- this."
+    )
 
     @model_validator(mode="after")
     def _gap_is_a_range(self) -> Goal:

@@ -151,6 +151,7 @@ class Policy:
         Raises:
             ValueError: observations of the wrong name, shape or type, or a state of the wrong
                 shape; the message names all of them, and what is expected.
+            NonFiniteError: the network's actions are NaN.
         """
         tensors, is_single = self._tensors(observations, state)
         actions, after = self.network.act(

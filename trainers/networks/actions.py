@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from encoders.spaces import bounded
-from trainers.common.errors import UserError
+from trainers.common.errors import NonFiniteError, UserError
 
 
 class ActionScaling(nn.Module):
@@ -63,8 +63,18 @@ class ActionScaling(nn.Module):
 
 
 def to_environment(actions: Tensor, space: gymnasium.Space[Any]) -> NDArray[Any]:
-    """Actions as the environment takes them: an array, within a Box, or counted from a start."""
-    return within(actions.cpu(), space).numpy()
+    """Actions as the environment takes them: an array, within a Box, or counted from a start.
+
+    Raises:
+        NonFiniteError: one is NaN.
+    """
+    chosen = within(actions.cpu(), space)
+    if chosen.isnan().any():
+        raise NonFiniteError(
+            "the policy's actions are NaN: a setting of its encoders is out of all proportion, or "
+            "its weights are"
+        )
+    return chosen.numpy()
 
 
 def within(actions: Tensor, space: gymnasium.Space[Any]) -> Tensor:

@@ -17,7 +17,7 @@ from torch import nn
 
 from encoders.conv import Conv
 from encoders.spaces import RgbImage
-from trainers.common.errors import UserError
+from trainers.common.errors import NonFiniteError, UserError
 from trainers.networks.action_models import GaussianActions
 from trainers.networks.actions import to_environment
 from trainers.networks.actor_critic import ActorCritic, PolicySettings
@@ -342,3 +342,10 @@ def test_actions_are_clipped_to_the_box_and_left_alone_otherwise() -> None:
     actions = torch.tensor([[-3.0, -3.0], [0.5, 0.25], [3.0, 3.0]])
     assert to_environment(actions, space).tolist() == [[-1.0, 0.0], [0.5, 0.25], [1.0, 0.5]]
     assert to_environment(torch.tensor([2, 0]), Discrete(3)).tolist() == [2, 0]
+
+
+def test_actions_that_are_nan_never_reach_an_environment() -> None:
+    space = Box(-1.0, 1.0, (2,))
+    assert to_environment(torch.tensor([[math.inf, 0.0]]), space).tolist() == [[1.0, 0.0]]
+    with pytest.raises(NonFiniteError, match="the policy's actions are NaN"):
+        to_environment(torch.tensor([[0.0, 0.0], [math.nan, 0.0]]), space)
