@@ -20,7 +20,7 @@ from trainers.runfile.former_keys import brought_up_to_date, tell
 from trainers.runfile.inheritance import read_run_file
 from trainers.runfile.overrides import override
 from trainers.runfile.registry import Registries, Registry, UnknownComponentError
-from trainers.runfile.validation import InvalidError, Model, not_finite, validate
+from trainers.runfile.validation import InvalidError, Model, float_problems, validate
 from trainers.runfile.yaml_document import (
     Document,
     KeyPath,
@@ -235,8 +235,8 @@ class _Sections:
     def run(self) -> RunSettings:
         if problem := foreign_file(self.document):
             raise SettingsError([problem])
-        for path in not_finite(self.document.data):
-            self.problem(path, "should be a finite number")
+        for path, said in float_problems(self.document.data):
+            self.problem(path, said)
         if self.problems:
             raise SettingsError(self.problems)
         top = self.validate(RunFile, self.document.data, ())

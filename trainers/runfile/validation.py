@@ -34,6 +34,9 @@ PLAIN_WORDS = {
 PYDANTIC_EXTRAS = r"^\w+ (?=should )| after validation, not \d+$"
 """Parts to leave out of pydantic's other messages: "Input should be" and the like."""
 
+MAX_FLOAT32 = (2.0 - 2.0**-23) * 2.0**127
+"""Largest number of networks and observations, 3.4e38."""
+
 
 class InvalidError(Exception):
     """Data does not fit a model.
@@ -174,13 +177,15 @@ def fits_literals(model: type[BaseModel], data: Any) -> bool:
     )
 
 
-def not_finite(data: Any, path: KeyPath = ()) -> Iterator[KeyPath]:
-    """Find the numbers that are infinite or not a number."""
+def float_problems(data: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, str]]:
+    """What is wrong with numbers that are none, or that networks can't calculate with."""
     if isinstance(data, dict):
         for key, value in data.items():
-            yield from not_finite(value, (*path, key))
+            yield from float_problems(value, (*path, key))
     elif isinstance(data, list):
         for index, value in enumerate(data):
-            yield from not_finite(value, (*path, index))
+            yield from float_problems(value, (*path, index))
     elif isinstance(data, float) and not math.isfinite(data):
-        yield path
+        yield path, "should be a finite number"
+    elif isinstance(data, float) and abs(data) > MAX_FLOAT32:
+        yield path, f"should be within +-{MAX_FLOAT32:.2g}, not {shown(data)}"

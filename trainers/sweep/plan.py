@@ -22,7 +22,7 @@ from trainers.runfile.settings import (
     load_run_document,
     resolved,
 )
-from trainers.runfile.validation import InvalidError, not_finite, validate
+from trainers.runfile.validation import InvalidError, float_problems, validate
 from trainers.runfile.yaml_document import (
     Document,
     KeyPath,
@@ -215,7 +215,7 @@ def load_sweep(path: Path, registries: Registries) -> Sweep:
 
 def _settings(document: Document) -> SweepSettings:
     problems: list[tuple[KeyPath, str]]
-    problems = [(path, "should be a finite number") for path in not_finite(document.data)]
+    problems = list(float_problems(document.data))
     if not problems:
         try:
             settings = validate(SweepSettings, document.data)

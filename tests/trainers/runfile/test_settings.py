@@ -537,6 +537,10 @@ class TestInvalid:
             ),
             ("hyperparameters: 3", "hyperparameters: should be a mapping (key: value), not 3"),
             ("hyperparameters: {learning_rate: .inf}", None),
+            (
+                "hyperparameters: {learning_rate: 1e39}",
+                "hyperparameters.learning_rate: should be within +-3.4e+38, not 1e+39",
+            ),
             ("memory: {sise: 3}", "memory.sise: unknown key; did you mean 'size'?"),
             ("decay: {sise: 3}", "decay.sise: unknown key; did you mean 'size'?"),
             (
@@ -848,8 +852,10 @@ class TestResolved:
         assert yaml.safe_load(dump_yaml(run)) == resolved(run)
 
     @given(
-        rate=st.floats(min_value=0, exclude_min=True, allow_infinity=False, allow_nan=False),
-        weight=st.floats(allow_infinity=False, allow_nan=False),
+        rate=st.floats(
+            min_value=0, exclude_min=True, allow_infinity=False, allow_nan=False, width=32
+        ),
+        weight=st.floats(allow_infinity=False, allow_nan=False, width=32),
         simulator=st.text(st.characters(codec="utf-8")),
         device=st.sampled_from(["cpu", "1e-3", "yes", "null", "0o7", "~", "cuda:0"]),
         seed=st.integers(0, 2**32 - 1),
