@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from torch import nn
 
 from encoders.inputs import fill_gaps
-from encoders.layers import Size, dense
+from encoders.layers import Size, Thickness, dense
 from encoders.points import (
     ATTENTION_GAIN,
     COORDINATES,
@@ -62,8 +62,8 @@ class Keypoints(PointEncoder):
             description="Numbers that patches are described with; bfloat16 is faster where the "
             "processor knows it. Places are always float32.",
         )
-        clip_m: float = Field(
-            0.05, gt=0.0, description="Depths in a patch count up to so far from its middle's."
+        clip_m: Thickness = Field(
+            0.05, description="Depths in a patch count up to so far from its middle's."
         )
 
     def __init__(self, space: Box, settings: Settings) -> None:

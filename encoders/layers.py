@@ -16,6 +16,8 @@ Size = Annotated[int, Field(ge=1, le=2**16)]
 """Settings: a width, a number of filters, a length in pixels."""
 Depth = Annotated[int, Field(ge=1, le=100)]
 """Settings: a number of layers."""
+Thickness = Annotated[float, Field(ge=1e-4, le=100.0)]
+"""Settings: a difference of depths in metres, from that of a camera's step to that of its range."""
 Window = tuple[int, int]
 """Kernel and stride (pixels) of anything that slides over an image without padding."""
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from torch import nn
 
 from encoders.inputs import nearest_surfaces
-from encoders.layers import Size, dense
+from encoders.layers import Size, Thickness, dense
 from encoders.points import (
     ATTENTION_GAIN,
     COORDINATES,
@@ -62,13 +62,13 @@ class SecondLook(PointEncoder):
         """Settings of the encoder ``second_look``."""
 
         cell: Size = Field(5, description="Side of a cell in pixels.")
-        surface_m: float = Field(
-            0.03, gt=0.0, description="Pixels of a cell's surface lie so far from its nearest."
+        surface_m: Thickness = Field(
+            0.03, description="Pixels of a cell's surface lie so far from its nearest."
         )
         patch: int = Field(5, ge=2, description="Side of a patch in cells.")
         stride: Size = Field(2, description="Cells from one patch to the next.")
-        clip_m: float = Field(
-            0.05, gt=0.0, description="Depths in a patch count up to so far from its middle's."
+        clip_m: Thickness = Field(
+            0.05, description="Depths in a patch count up to so far from its middle's."
         )
         hidden_units: Size = Field(96, description="Units of the two layers that describe a patch.")
         values: Size = Field(
