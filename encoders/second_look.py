@@ -79,12 +79,12 @@ class SecondLook(PointEncoder):
         query_units: Size = Field(
             64, description="Units of the layer that turns the first look into queries."
         )
-        logit_cap: float | None = Field(
+        logit_std: float | None = Field(
             None,
             gt=0.0,
-            description="Logits of the second look's attention are bent to stay within this: "
-            "cap * tanh(logit / cap). Without it a map may harden on one patch, where it has no "
-            "gradient any more. null: as they are.",
+            description="Logits of a map of the second look are scaled down where their standard "
+            "deviation over an image's patches is over this. Without it a map may harden on one "
+            "patch, where it has no gradient any more. null: as they are.",
         )
         normalize_queries: bool = Field(
             False,
@@ -135,15 +135,22 @@ class SecondLook(PointEncoder):
             logits = described @ described_queries
         with torch.autocast(raw.device.type, enabled=False):
             places = torch.cat([points, squares / COORDINATES], dim=-1) @ place_queries
-            attention = _weights(self._capped(logits.float() + places), unseen)
+            logits = self._bounded(logits.float() + places, unseen)
+            attention = _weights(logits, unseen)
             return torch.cat(
                 [first, attended(attention, points, squares, second_values.float())], dim=1
             )
 
-    def _capped(self, logits: torch.Tensor) -> torch.Tensor:
-        """Logit soft-capping (Gemma Team 2024, arXiv:2408.00118, section 2)."""
-        cap = self._settings.logit_cap
-        return logits if cap is None else cap * torch.tanh(logits / cap)
+    def _bounded(self, logits: torch.Tensor, unseen: torch.Tensor) -> torch.Tensor:
+        """Logits (B, n, K) of no more than `logit_std` over the patches that were seen."""
+        limit = self._settings.logit_std
+        if limit is None:
+            return logits
+        seen = (~unseen).to(logits.dtype)
+        share = seen / seen.sum(dim=1, keepdim=True).clamp(min=1.0)
+        centred = logits - (share * logits).sum(dim=1, keepdim=True)
+        variance = (share * centred.square()).sum(dim=1, keepdim=True)
+        return centred * (limit * variance.clamp(min=limit**2).rsqrt())
 
     def _look(self, depth_m: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Depths (B, H, W) -> shapes (B, n, 3 * p * p), middles (B, n, 3), unseen (B, n, 1)."""

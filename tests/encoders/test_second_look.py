@@ -111,10 +111,20 @@ def test_where_the_second_look_goes_depends_on_what_the_first_one_found():
     assert not torch.allclose(queries[0], queries[2])
 
 
-def test_capped_logits_leave_every_patch_some_attention():
-    encoder = make(logit_cap=2.0)
-    capped = encoder._capped(torch.tensor([-1e3, 0.0, 0.01, 1e3]))
-    assert capped.tolist() == pytest.approx([-2.0, 0.0, 0.01, 2.0], rel=1e-4)
+def test_logits_that_spread_too_far_are_scaled_down_over_what_was_seen():
+    encoder = make(logit_std=2.0)
+    logits = torch.tensor([[10.0, 1.0], [4.0, 0.0], [10.0, 1.0], [4.0, 0.0], [1e3, -1e3]])
+    unseen = torch.tensor([False, False, False, False, True])
+    bounded = encoder._bounded(logits[None], unseen[None, :, None])[0]
+    wide, narrow = bounded[:4].T  # standard deviations of 3 and 0.5
+    assert wide.tolist() == pytest.approx([2.0, -2.0, 2.0, -2.0])
+    assert narrow.tolist() == pytest.approx([0.5, -0.5, 0.5, -0.5])
+    nothing_seen = encoder._bounded(logits[None], torch.ones(1, 5, 1, dtype=torch.bool))
+    assert nothing_seen.isfinite().all()
+
+
+def test_bounded_logits_leave_no_map_on_one_patch_alone():
+    encoder = make(logit_std=2.0)
     for layer in (encoder.queries.out.weight, encoder.queries.out.bias):
         layer.data *= 1e4
     points = middles(slanted()).reshape(-1, 3)
