@@ -17,6 +17,9 @@ import torch.distributed as dist
 from torch import Tensor
 
 from trainers.common.errors import first_lines
+from trainers.common.timers import timed
+from trainers.distributed import shared_memory
+from trainers.distributed.shared_memory import SharedMemory, connected_sockets
 from trainers.distributed.world import ALONE, RankLostError, Ranks, World
 
 TIMEOUT_S = 600.0
@@ -33,8 +36,10 @@ class Processes(Ranks):
     def __init__(self) -> None:
         super().__init__(dist.get_rank(), dist.get_world_size())
         self._store = dist.distributed_c10d._get_default_store()
+        self._memory: SharedMemory | None = None
         self._names = [f"rank {rank}" for rank in range(self.size)]
         self._names = self.gather(f"rank {self.rank} ({socket.gethostname()}, {os.getpid()})")
+        self._memory = self._shared() if shared_memory.is_possible() else None
 
     def name(self, rank: int) -> str:
         """See `Ranks.name`: with its machine and the process's number."""
@@ -46,16 +51,25 @@ class Processes(Ranks):
 
     def gather(self, value: Value) -> list[Value]:
         """See `World.gather`."""
-        values: list[Any] = [None] * self.size
-        with self._naming_the_lost():
+        with timed("gather"), self._naming_the_lost():
+            if self._memory is not None:
+                return self._memory.gather(value)
+            values: list[Any] = [None] * self.size
             dist.all_gather_object(values, value)
-        return values
+            return values
 
     def sum(self, values: Tensor) -> Tensor:
         """See `Ranks.sum`."""
-        with self._naming_the_lost():
+        with timed("all_reduce"), self._naming_the_lost():
+            if self._memory is not None and values.device.type == "cpu":
+                return self._memory.sum(values)
             dist.all_reduce(values)
-        return values
+            return values
+
+    def _shared(self) -> SharedMemory:
+        with self._naming_the_lost():
+            peers = connected_sockets(self.rank, self.size, self.first, TIMEOUT_S)
+        return SharedMemory(self.rank, self.size, peers)
 
     @contextmanager
     def _naming_the_lost(self) -> Iterator[None]:
@@ -66,8 +80,10 @@ class Processes(Ranks):
         """
         try:
             yield
-        except RuntimeError as error:
+        except (RuntimeError, OSError) as error:
             # So that those notice, too, which wait for this one.
+            if self._memory is not None:
+                self._memory.close()
             dist.destroy_process_group()
             lost = self._roll_call()
             if not lost:

@@ -187,10 +187,10 @@ class Ranks(World):
         self, tensors: Sequence[Tensor], weight: float, *, stop: bool = False
     ) -> Sequence[Tensor]:
         """See `World.mean`; all go in one flat vector, and the wish to stop with them."""
-        flat = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
-        *sums, stops = self.sum(torch.cat([weight * flat, flat.new_full((1,), float(stop))])).split(
-            [*(tensor.numel() for tensor in tensors), 1]
-        )
+        flat = [tensor.detach().reshape(-1) for tensor in tensors]
+        values = torch.cat([*flat, flat[0].new_full((1,), float(stop))])
+        values[:-1] *= weight
+        *sums, stops = self.sum(values).split([*map(len, flat), 1])
         if stops.item() > 0:
             raise StopRequested
         return [part.view_as(own) for part, own in zip(sums, tensors, strict=True)]

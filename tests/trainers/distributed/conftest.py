@@ -2,62 +2,58 @@
 
 from __future__ import annotations
 
-import copy
-import threading
-from collections.abc import Callable, Sequence
+import socket
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import pytest
-import torch
 from torch import Tensor
 
+from trainers.distributed.shared_memory import SharedMemory
 from trainers.distributed.world import Ranks
 
 Result = TypeVar("Result")
 TIMEOUT_S = 60.0
 
 
-@dataclass
-class Table:
-    """Where k threads put what they tell each other."""
-
-    size: int
-    values: list[Any] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.values = [None] * self.size
-        self.barrier = threading.Barrier(self.size)
+def memories(size: int) -> list[SharedMemory]:
+    """What k ranks share, for each of them."""
+    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(size - 1)]
+    for peer in (peer for pair in pairs for peer in pair):
+        peer.settimeout(TIMEOUT_S)
+    first = SharedMemory(0, size, [own for own, _ in pairs])
+    others = enumerate((theirs for _, theirs in pairs), start=1)
+    return [first, *(SharedMemory(rank, size, [peer]) for rank, peer in others)]
 
 
 class ThreadRanks(Ranks):
     """One of k threads."""
 
-    def __init__(self, rank: int, table: Table):
-        super().__init__(rank, table.size)
-        self._table = table
+    def __init__(self, rank: int, size: int, memory: SharedMemory):
+        super().__init__(rank, size)
+        self.memory = memory
 
     def gather(self, value: Any) -> list[Any]:
-        self._table.values[self.rank] = copy.deepcopy(value)
-        self._table.barrier.wait(TIMEOUT_S)
-        values = copy.deepcopy(self._table.values)
-        self._table.barrier.wait(TIMEOUT_S)
-        return values
+        return self.memory.gather(value)
 
     def sum(self, values: Tensor) -> Tensor:
-        return torch.stack(self.gather(values)).sum(0)
+        return self.memory.sum(values)
 
 
 @pytest.fixture
-def ranks() -> Callable[[int], list[ThreadRanks]]:
+def ranks() -> Iterator[Callable[[int], list[ThreadRanks]]]:
     """k ranks, each for a thread of its own."""
+    built: list[ThreadRanks] = []
 
     def build(size: int) -> list[ThreadRanks]:
-        table = Table(size)
-        return [ThreadRanks(rank, table) for rank in range(size)]
+        made = [ThreadRanks(rank, size, memory) for rank, memory in enumerate(memories(size))]
+        built.extend(made)
+        return made
 
-    return build
+    yield build
+    for rank in built:
+        rank.memory.close()
 
 
 @pytest.fixture

@@ -1,0 +1,143 @@
+"""What processes of one machine exchange through the memory that they share."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import re
+import signal
+import time
+from collections.abc import Callable
+from functools import reduce
+from operator import add
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from trainers.distributed.shared_memory import SharedMemory, connected_sockets
+
+TIMEOUT_S = 60.0
+PROCESSES = multiprocessing.get_context("fork")
+Work = Callable[[int, SharedMemory], Any]
+
+
+def in_processes(size: int, work: Work, timeout_s: float = TIMEOUT_S) -> dict[int, Any]:
+    """What a function returns in each of k processes, or raises there; nothing of one that died."""
+    names, results = PROCESSES.SimpleQueue(), PROCESSES.SimpleQueue()
+
+    def first(name: bytes) -> bytes:
+        for _ in range(size - 1 if name else 0):
+            names.put(name)
+        return name or names.get()
+
+    def run(rank: int) -> None:
+        torch.set_num_threads(1)
+        peers = connected_sockets(rank, size, first, timeout_s)
+        try:
+            results.put((rank, work(rank, SharedMemory(rank, size, peers))))
+        except OSError as error:
+            results.put((rank, type(error)))
+
+    processes = [PROCESSES.Process(target=run, args=(rank,)) for rank in range(size)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(TIMEOUT_S)
+        assert process.exitcode is not None, "it hangs"
+    return dict(results.get() for _ in processes if not results.empty())
+
+
+def values_of(rank: int, count: int, turn: int = 0) -> Tensor:
+    """Numbers whose sum depends on the order that they are added in."""
+    generator = torch.Generator().manual_seed(1000 * turn + rank)
+    return torch.randn(count, generator=generator) * 10.0 ** (rank % 3)
+
+
+@pytest.mark.parametrize("size", [2, 3, 8])  # 8 are more than many machines have cores
+def test_sums_are_those_in_the_order_of_ranks_to_the_last_bit(size: int) -> None:
+    """Over and over, of few values and of many, while the processes run ahead of each other."""
+    counts = [1, 5, 10_000, 3, size - 1, 100_001, 7] * 2
+
+    def work(rank: int, memory: SharedMemory) -> list[Tensor]:
+        wrong = []
+        for turn, count in enumerate(counts):
+            time.sleep(0.002 * ((turn + rank) % 3))
+            own = values_of(rank, count, turn)
+            expected = reduce(add, [values_of(other, count, turn) for other in range(size)])
+            if not torch.equal(memory.sum(own), expected):
+                wrong.append(count)
+        return wrong
+
+    assert in_processes(size, work) == {rank: [] for rank in range(size)}
+    assert not torch.equal(  # so that another order would be noticed
+        reduce(add, [values_of(rank, 1000) for rank in range(3)]),
+        reduce(add, [values_of(rank, 1000) for rank in reversed(range(3))]),
+    )
+
+
+def test_sums_keep_the_kind_of_the_values() -> None:
+    def work(rank: int, memory: SharedMemory) -> list[Any]:
+        counted = memory.sum(torch.tensor([2**40 + rank, 1]))
+        exact = memory.sum(torch.tensor([2.0**-40 + rank], dtype=torch.float64))
+        return [counted.tolist(), exact.item()]
+
+    assert in_processes(2, work) == {rank: [[2**41 + 1, 2], 1.0 + 2.0**-39] for rank in range(2)}
+
+
+def test_everyones_values_come_by_rank_whatever_their_sizes() -> None:
+    def work(rank: int, memory: SharedMemory) -> Any:
+        few = memory.gather({"rank": rank})
+        many = memory.gather(bytes([rank]) * 10 ** (3 * rank))
+        again = memory.gather(None if rank else torch.arange(3))
+        return few, [(len(part), set(part)) for part in many], again[0].tolist(), again[1:]
+
+    expected = (
+        [{"rank": 0}, {"rank": 1}, {"rank": 2}],
+        [(1, {0}), (1_000, {1}), (1_000_000, {2})],
+        [0, 1, 2],
+        [None, None],
+    )
+    assert in_processes(3, work) == dict.fromkeys(range(3), expected)
+
+
+@pytest.mark.parametrize("dies", [0, 1])
+@pytest.mark.parametrize("exchange", ["sum", "gather"])
+def test_one_that_is_killed_is_noticed_at_once_by_all(dies: int, exchange: str) -> None:
+    def work(rank: int, memory: SharedMemory) -> float:
+        memory.sum(torch.ones(4))
+        if rank == dies:
+            time.sleep(0.2)  # the others wait
+            os.kill(os.getpid(), signal.SIGKILL)
+        try:
+            getattr(memory, exchange)(torch.ones(100_000))
+        finally:
+            memory.close()  # so that those notice who wait for this one
+
+    begin = time.monotonic()
+    ends = in_processes(3, work)
+    assert ends.keys() == {0, 1, 2} - {dies}
+    assert all(issubclass(end, ConnectionError) for end in ends.values())
+    assert time.monotonic() - begin < 10.0
+
+
+def test_one_that_does_not_come_is_waited_for_no_longer_than_is_said() -> None:
+    def work(rank: int, memory: SharedMemory) -> Tensor:
+        if rank == 1:
+            time.sleep(1.0)
+        return memory.sum(torch.ones(1))
+
+    assert in_processes(2, work, timeout_s=0.2)[0] is TimeoutError
+
+
+def test_nothing_can_be_left_of_what_is_shared() -> None:
+    """It is no file from the beginning, so that nobody need take it away, however all end."""
+
+    def work(rank: int, memory: SharedMemory) -> tuple[str, ...]:
+        memory.sum(torch.ones(100_000))
+        maps = Path("/proc/self/maps").read_text()
+        return tuple(re.findall(r"rw-s .* (/(?:memfd:|dev/shm/(?!sem\.)).*)", maps))
+
+    assert in_processes(2, work) == dict.fromkeys(range(2), ("/memfd:ventosa (deleted)",))
