@@ -143,8 +143,9 @@ class TRPO(OnPolicyAlgorithm):
         delta = hyper.delta_schedule.value(hyper.delta, run_fraction)
         rate = hyper.learning_rate_schedule.value(hyper.learning_rate, run_fraction)
         set_learning_rates(self._optimizer, [rate])
-        statistics = self._improve_policy(rollout, delta)
-        statistics |= self._fit_critic(rollout)
+        pooled = rollout.pooled(self._env_runner.world)
+        statistics = self._improve_policy(rollout, pooled, delta)
+        statistics |= self._fit_critic(pooled)
         self._show(rollout)
         return statistics | {
             "Policy/Learning Rate": rate,
@@ -152,7 +153,7 @@ class TRPO(OnPolicyAlgorithm):
             "Policy/Explained Variance": self._explained_variance(rollout),
         }
 
-    def _improve_policy(self, rollout: Rollout, delta: float) -> dict[str, float]:
+    def _improve_policy(self, rollout: Rollout, pooled: Rollout, delta: float) -> dict[str, float]:
         hyper = self._hyperparameters
         rows = rollout.in_shuffle_groups()
         observations = rollout.observations(rows)
@@ -173,7 +174,7 @@ class TRPO(OnPolicyAlgorithm):
             gain, divergence = mean([gain_of(new), old.kl(new).mean()])
             return gain, divergence
 
-        step = self._step(rollout, gradient, delta)
+        step = self._step(pooled, gradient, delta)
         search = line_search(
             measure,
             self._theta,

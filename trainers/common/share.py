@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -66,3 +67,19 @@ class Share:
         among = (environment >= 0) & (environment < self.count)
         own = (step * self.count + environment)[among]
         return (own, len(own) / len(rows)) if len(own) else (step[:1] * self.count, 0.0)
+
+    def part(self, rows: Tensor, groups: Tensor) -> Tensor:
+        """An equal part of a minibatch, whoever's environments it is from.
+
+        Args:
+            rows: (B,) of the minibatch.
+            groups: (B,) numbers of what stays together, and is side by side.
+
+        Returns:
+            (b,) rows: B n / N of them, as near as whole groups allow; that can be none.
+        """
+        _, lengths = groups.unique_consecutive(return_counts=True)
+        ends = torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
+        limits = torch.tensor([self.first, self.first + self.count]) * (len(rows) / self.total)
+        begin, end = (ends - limits[:, None]).abs().argmin(1)
+        return rows[ends[begin] : ends[end]]

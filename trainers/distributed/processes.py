@@ -6,7 +6,7 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from datetime import timedelta
 from pathlib import Path
@@ -41,6 +41,11 @@ class Processes(Ranks):
         self._names = self.gather(f"rank {self.rank} ({socket.gethostname()}, {os.getpid()})")
         self._memory = self._shared() if shared_memory.is_possible() else None
 
+    @property
+    def shares_memory(self) -> bool:  # type: ignore[override]
+        """See `World`."""
+        return self._memory is not None
+
     def name(self, rank: int) -> str:
         """See `Ranks.name`: with its machine and the process's number."""
         return self._names[rank]
@@ -58,13 +63,20 @@ class Processes(Ranks):
             dist.all_gather_object(values, value)
             return values
 
-    def sum(self, values: Tensor) -> Tensor:
+    def sum(self, parts: Sequence[Tensor], weight: float) -> Tensor:
         """See `Ranks.sum`."""
         with timed("all_reduce"), self._naming_the_lost():
-            if self._memory is not None and values.device.type == "cpu":
-                return self._memory.sum(values)
+            if self._memory is not None and not parts[0].is_cuda:
+                return self._memory.sum(parts, weight)
+            values = torch.cat([*parts]).mul_(weight)
             dist.all_reduce(values)
             return values
+
+    def pool(self, tensors: Sequence[Tensor]) -> Sequence[Tensor]:
+        """See `World.pool`."""
+        assert self._memory is not None  # or it is not asked
+        with timed("gather"), self._naming_the_lost():
+            return self._memory.pool(tensors)
 
     def _shared(self) -> SharedMemory:
         with self._naming_the_lost():

@@ -7,6 +7,7 @@ no core from the others, and who dies is noticed at once, as the system closes w
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import pickle
@@ -75,26 +76,35 @@ class SharedMemory:
     def __init__(self, rank: int, size: int, peers: Sequence[socket.socket]):
         self._rank, self._size, self._peers = rank, size, peers
         self._places = torch.empty(size + 1, 0, dtype=torch.uint8)
+        self._pool = torch.empty(0, dtype=torch.uint8)
 
-    def sum(self, values: Tensor) -> Tensor:
-        """Sums (n,) of everyone's, in place: added by rank, so that they are alike everywhere.
+    def sum(self, parts: Sequence[Tensor], weight: float) -> Tensor:
+        """Sums of everyone's values: added by rank, so that they are alike everywhere.
 
-        Each process adds up a part of them.
+        Each process adds up as many of them.
+
+        Args:
+            parts: vectors of one kind, n numbers in all.
+            weight: of one's own.
+
+        Returns:
+            (n,) of its own.
 
         Raises:
             OSError: one of the others is gone, or has not come in time.
         """
-        count = values.numel()
-        self._make_room(values.nbytes)
-        *places, total = self._places[:, : values.nbytes].view(values.dtype)
-        places[self._rank].copy_(values)
+        length = sum(part.nbytes for part in parts)
+        self._make_room(length)
+        *places, total = self._places[:, :length].view(parts[0].dtype)
+        torch.cat([*parts], out=places[self._rank]).mul_(weight)
         self._wait()
-        part = slice(self._rank * count // self._size, (self._rank + 1) * count // self._size)
-        torch.add(places[0][part], places[1][part], out=total[part])
-        for place in places[2:]:
-            total[part] += place[part]
+        ends = [rank * len(total) // self._size for rank in (self._rank, self._rank + 1)]
+        first, second, *others = (place[slice(*ends)] for place in places)
+        own = torch.add(first, second, out=total[slice(*ends)])
+        for other in others:
+            own += other
         self._wait()
-        return values.copy_(total)
+        return total.clone()
 
     def gather(self, value: Any) -> list[Any]:
         """Everyone's values, by rank.
@@ -112,6 +122,32 @@ class SharedMemory:
         self._wait()
         return values
 
+    def pool(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+        """Everyone's (sum of n, ...), by rank: views of the memory, valid until the next call.
+
+        Args:
+            tensors: (n, ...) one's own; alike everywhere but for n.
+
+        Raises:
+            OSError: one of the others is gone, or has not come in time.
+        """
+        lengths = torch.tensor(self.gather([len(own) for own in tensors]))
+        firsts, totals = lengths[: self._rank].sum(0).tolist(), lengths.sum(0).tolist()
+        row_bytes = [own.element_size() * math.prod(own.shape[1:]) for own in tensors]
+        rooms = [_whole_pages(total * row) for total, row in zip(totals, row_bytes, strict=True)]
+        if sum(rooms) > len(self._pool):
+            self._pool = self._map(sum(rooms))
+        wholes = []
+        for own, first, total, room in zip(
+            tensors, firsts, totals, self._pool[: sum(rooms)].split(rooms), strict=True
+        ):
+            count = total * math.prod(own.shape[1:])
+            whole = room.view(own.dtype)[:count].view(total, *own.shape[1:])
+            whole[first : first + len(own)] = own
+            wholes.append(whole)
+        self._wait()
+        return wholes
+
     def close(self) -> None:
         """Lets the others notice that this process exchanges nothing any more."""
         for peer in self._peers:
@@ -119,12 +155,15 @@ class SharedMemory:
 
     def _make_room(self, length: int) -> None:
         """Gives each a place of so many bytes at least, if they are smaller."""
-        if length <= self._places.shape[1]:
-            return
-        length = -(-length // PAGE_BYTES) * PAGE_BYTES
+        if length > self._places.shape[1]:
+            length = _whole_pages(length)
+            self._places = self._map((self._size + 1) * length).view(self._size + 1, length)
+
+    def _map(self, length: int) -> Tensor:
+        """New memory of so many bytes, the same for all."""
         if self._rank == 0:
             file = os.memfd_create("ventosa")
-            os.truncate(file, (self._size + 1) * length)
+            os.truncate(file, length)
             for peer in self._peers:
                 socket.send_fds(peer, [HANDED_ON], [file])
         else:
@@ -133,7 +172,7 @@ class SharedMemory:
             (file,) = files
         memory = mmap.mmap(file, 0)
         os.close(file)
-        self._places = torch.frombuffer(memory, dtype=torch.uint8).view(self._size + 1, length)
+        return torch.frombuffer(memory, dtype=torch.uint8)
 
     def _wait(self) -> None:
         """Returns once everyone has come here."""
@@ -149,6 +188,11 @@ class SharedMemory:
             for peer in self._peers:
                 peer.send(NUMBER.pack(largest))
             return largest
+
+
+def _whole_pages(length: int) -> int:
+    """The bytes of the pages that so many take."""
+    return -(-length // PAGE_BYTES) * PAGE_BYTES
 
 
 def _received(peer: socket.socket) -> int:

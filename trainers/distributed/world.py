@@ -40,10 +40,12 @@ class World:
     Attributes:
         rank: number of this process, from 0. The first writes.
         size: k, how many there are.
+        shares_memory: whether all of them can `pool`.
     """
 
     rank = 0
     size = 1
+    shares_memory = False
 
     @property
     def writes(self) -> bool:
@@ -110,6 +112,14 @@ class World:
         """
         return rows
 
+    def pool(self, tensors: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Everyone's (sum of n, ...), one rank's after the other's, in memory that all read.
+
+        Args:
+            tensors: (n, ...) one's own, on the CPU. What they become is valid until the next call.
+        """
+        return tensors
+
     def all_groups(self, groups: Tensor, count: int) -> Tensor:
         """Everyone's groups (T N,), as `all_rows`; numbered in the order in which they come first.
 
@@ -146,8 +156,13 @@ class Ranks(World):
         self.rank, self.size = rank, size
         self._told: BaseException | None = None
 
-    def sum(self, values: Tensor) -> Tensor:
-        """Sums (n,) of everyone's, the same to the last bit everywhere."""
+    def sum(self, parts: Sequence[Tensor], weight: float) -> Tensor:
+        """Sums (n,) of everyone's parts, one after the other; the same to the last bit everywhere.
+
+        Args:
+            parts: vectors of the same kind.
+            weight: of one's own.
+        """
         raise NotImplementedError
 
     def name(self, rank: int) -> str:
@@ -160,7 +175,7 @@ class Ranks(World):
 
     def any(self, condition: bool) -> bool:
         """See `World.any`."""
-        return self.sum(torch.tensor([float(condition)])).item() > 0
+        return self.sum([torch.tensor([float(condition)])], 1.0).item() > 0
 
     @contextmanager
     def together(self) -> Iterator[None]:
@@ -187,10 +202,10 @@ class Ranks(World):
         self, tensors: Sequence[Tensor], weight: float, *, stop: bool = False
     ) -> Sequence[Tensor]:
         """See `World.mean`; all go in one flat vector, and the wish to stop with them."""
-        flat = [tensor.detach().reshape(-1) for tensor in tensors]
-        values = torch.cat([*flat, flat[0].new_full((1,), float(stop))])
-        values[:-1] *= weight
-        *sums, stops = self.sum(values).split([*map(len, flat), 1])
+        parts = [tensor.detach().reshape(-1) for tensor in tensors]
+        # Of who weighs nothing it is heard at the next mean.
+        parts.append(parts[0].new_full((1,), float(stop)))
+        *sums, stops = self.sum(parts, weight).split([len(part) for part in parts])
         if stops.item() > 0:
             raise StopRequested
         return [part.view_as(own) for part, own in zip(sums, tensors, strict=True)]

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from trainers.common.errors import UserError
 from trainers.common.share import Share
+from trainers.distributed.world import World
 from trainers.experience.returns import leave_one_out
 from trainers.networks.observations import Observations, gather
 from trainers.networks.recurrent import Sequences
+
+POOLED_ROWS = ("hidden_states", "actions", "log_probs", "values", "advantages", "returns")
+"""Fields of a rollout that are pooled as they are."""
 
 
 class Minibatch(NamedTuple):
@@ -51,6 +55,7 @@ class Rollout:
         values: under the critic of that time.
         advantages: see `trainers.experience.returns.gae`.
         returns: what the critic should have said.
+        places: (T N,) of everyone's transitions, where they are `pooled`; None: one's own are here.
     """
 
     share: Share
@@ -65,6 +70,7 @@ class Rollout:
     values: Tensor
     advantages: Tensor
     returns: Tensor
+    places: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -127,4 +133,33 @@ class Rollout:
         place = torch.randperm(count, generator=generator, device=device)
         order = torch.argsort(place[self.all_groups], stable=True)
         for rows in order.split(size):
-            yield Minibatch(*self.share.own(rows))
+            if self.places is None:
+                yield Minibatch(*self.share.own(rows))
+                continue
+            part = self.share.part(rows, self.all_groups[rows])
+            some = part if len(part) else rows[:1]
+            yield Minibatch(self.places[some], len(part) / len(rows))
+
+    def pooled(self, world: World) -> Rollout:
+        """Everyone's transitions where memory is shared, else one's own; valid until the next pool.
+
+        A minibatch has more transitions of some ranks' environments than of others', and in every
+        optimizer step all would wait for who has most. From a pool each takes an equal part.
+        """
+        if not world.shares_memory or self.actions.device.type != "cpu":
+            return self
+        size, steps = world.size, len(self.all_groups) // self.share.total
+        counts = world.gather(max(map(len, self.frames.values()), default=0))
+        own = {name: getattr(self, name) for name in POOLED_ROWS}
+        own["frame_index"] = self.frame_index + sum(counts[: world.rank])
+        pool = iter(world.pool([*own.values(), *self.frames.values(), *self.vectors.values()]))
+        # One rank's after the other's, by step, then by environment.
+        places = torch.arange(len(self.all_groups)).view(size, steps, -1).transpose(0, 1).flatten()
+        groups = torch.empty_like(self.all_groups)
+        groups[places] = self.all_groups
+        rows: dict[str, Any] = {name: next(pool) for name in own}
+        frames = {name: next(pool) for name in self.frames}
+        vectors = {name: next(pool) for name in self.vectors}
+        return replace(
+            self, **rows, frames=frames, vectors=vectors, shuffle_groups=groups, places=places
+        )

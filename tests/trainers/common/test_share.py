@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from trainers.common.share import Share
 
@@ -41,3 +43,25 @@ def test_alone_all_are_ones_own() -> None:
     own, weight = Share.whole(3).own(rows)
     assert own is rows
     assert weight == 1.0
+
+
+def test_parts_of_a_minibatch_end_where_a_group_does_that_is_nearest() -> None:
+    rows = torch.tensor([70, 71, 72, 30, 10, 11, 50, 51])
+    groups = torch.tensor([7, 7, 7, 3, 1, 1, 5, 5])
+    parts = [Share(first, 2, 4).part(rows, groups).tolist() for first in (0, 2)]
+    assert parts == [[70, 71, 72, 30], [10, 11, 50, 51]]
+    # Of three the first ends at 3 of 8 / 3, the second at 6 of 16 / 3.
+    parts = [Share(first, 1, 3).part(rows, groups).tolist() for first in range(3)]
+    assert parts == [[70, 71, 72], [30, 10, 11], [50, 51]]
+
+
+@given(st.lists(st.integers(1, 6), min_size=1, max_size=20), st.integers(1, 5))
+def test_parts_are_a_partition_into_whole_groups(lengths: list[int], size: int) -> None:
+    groups = torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths))
+    rows = torch.arange(len(groups)) + 100
+    parts = [Share(2 * rank, 2, 2 * size).part(rows, groups) for rank in range(size)]
+    assert torch.equal(torch.cat(parts), rows)
+    found = [set(groups[part - 100].tolist()) for part in parts]
+    assert sum(map(len, found)) == len(lengths)
+    # Each end is off by half a group at most.
+    assert all(abs(len(part) - len(rows) / size) <= max(lengths) for part in parts)

@@ -28,7 +28,9 @@ def memories(size: int) -> list[SharedMemory]:
 
 
 class ThreadRanks(Ranks):
-    """One of k threads."""
+    """One of k threads, which share memory; or not, as if they were on several machines."""
+
+    shares_memory = True
 
     def __init__(self, rank: int, size: int, memory: SharedMemory):
         super().__init__(rank, size)
@@ -37,8 +39,11 @@ class ThreadRanks(Ranks):
     def gather(self, value: Any) -> list[Any]:
         return self.memory.gather(value)
 
-    def sum(self, values: Tensor) -> Tensor:
-        return self.memory.sum(values)
+    def sum(self, parts: Sequence[Tensor], weight: float) -> Tensor:
+        return self.memory.sum(parts, weight)
+
+    def pool(self, tensors: Sequence[Tensor]) -> Sequence[Tensor]:
+        return self.memory.pool(tensors)
 
 
 @pytest.fixture

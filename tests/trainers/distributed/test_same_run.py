@@ -268,6 +268,17 @@ def test_ranks_do_together_what_one_does(
     compare(course(alone, FEW), side_by_side(partial(course, updates=FEW), sessions))
 
 
+def test_ranks_do_so_on_several_machines(begun: Any, ranks: Any, side_by_side: Any) -> None:
+    """Where each learns from what its own environments gave."""
+    trainer, rest, settings = CASES["ppo that sees"]
+    (alone,) = begun([ALONE], trainer, settings, **rest)
+    worlds = ranks(4)
+    for world in worlds:
+        world.shares_memory = False
+    found = side_by_side(partial(course, updates=FEW), begun(worlds, trainer, settings, **rest))
+    compare(course(alone, FEW), found)
+
+
 @pytest.mark.soak
 @pytest.mark.parametrize("size", [2, 4])
 @pytest.mark.parametrize("case", CASES)

@@ -66,8 +66,8 @@ def test_sums_are_those_in_the_order_of_ranks_to_the_last_bit(size: int) -> None
         for turn, count in enumerate(counts):
             time.sleep(0.002 * ((turn + rank) % 3))
             own = values_of(rank, count, turn)
-            expected = reduce(add, [values_of(other, count, turn) for other in range(size)])
-            if not torch.equal(memory.sum(own), expected):
+            expected = reduce(add, [0.5 * values_of(other, count, turn) for other in range(size)])
+            if not torch.equal(memory.sum(own.split([1, count - 1]), 0.5), expected):
                 wrong.append(count)
         return wrong
 
@@ -80,11 +80,12 @@ def test_sums_are_those_in_the_order_of_ranks_to_the_last_bit(size: int) -> None
 
 def test_sums_keep_the_kind_of_the_values() -> None:
     def work(rank: int, memory: SharedMemory) -> list[Any]:
-        counted = memory.sum(torch.tensor([2**40 + rank, 1]))
-        exact = memory.sum(torch.tensor([2.0**-40 + rank], dtype=torch.float64))
-        return [counted.tolist(), exact.item()]
+        few = memory.sum([torch.tensor([rank + 1.0])], 1.0)
+        exact = memory.sum([torch.tensor([2.0**-40 + rank], dtype=torch.float64)], 1.0)
+        return [few.dtype, few.item(), exact.dtype, exact.item()]
 
-    assert in_processes(2, work) == {rank: [[2**41 + 1, 2], 1.0 + 2.0**-39] for rank in range(2)}
+    expected = [torch.float32, 3.0, torch.float64, 1.0 + 2.0**-39]
+    assert list(in_processes(2, work).values()) == [expected] * 2
 
 
 def test_everyones_values_come_by_rank_whatever_their_sizes() -> None:
@@ -103,16 +104,23 @@ def test_everyones_values_come_by_rank_whatever_their_sizes() -> None:
     assert in_processes(3, work) == dict.fromkeys(range(3), expected)
 
 
+EXCHANGES: dict[str, Callable[[SharedMemory], Any]] = {
+    "sum": lambda memory: memory.sum([torch.ones(100_000)], 1.0),
+    "gather": lambda memory: memory.gather(torch.ones(100_000)),
+    "pool": lambda memory: memory.pool([torch.ones(100_000, 2)]),
+}
+
+
 @pytest.mark.parametrize("dies", [0, 1])
-@pytest.mark.parametrize("exchange", ["sum", "gather"])
+@pytest.mark.parametrize("exchange", EXCHANGES)
 def test_one_that_is_killed_is_noticed_at_once_by_all(dies: int, exchange: str) -> None:
     def work(rank: int, memory: SharedMemory) -> float:
-        memory.sum(torch.ones(4))
+        memory.sum([torch.ones(4)], 1.0)
         if rank == dies:
             time.sleep(0.2)  # the others wait
             os.kill(os.getpid(), signal.SIGKILL)
         try:
-            getattr(memory, exchange)(torch.ones(100_000))
+            EXCHANGES[exchange](memory)
         finally:
             memory.close()  # so that those notice who wait for this one
 
@@ -127,17 +135,46 @@ def test_one_that_does_not_come_is_waited_for_no_longer_than_is_said() -> None:
     def work(rank: int, memory: SharedMemory) -> Tensor:
         if rank == 1:
             time.sleep(1.0)
-        return memory.sum(torch.ones(1))
+        return memory.sum([torch.ones(1)], 1.0)
 
     assert in_processes(2, work, timeout_s=0.2)[0] is TimeoutError
+
+
+ONLY_IN_MEMORY = frozenset({"/memfd:ventosa (deleted)"})
 
 
 def test_nothing_can_be_left_of_what_is_shared() -> None:
     """It is no file from the beginning, so that nobody need take it away, however all end."""
 
-    def work(rank: int, memory: SharedMemory) -> tuple[str, ...]:
-        memory.sum(torch.ones(100_000))
+    def work(rank: int, memory: SharedMemory) -> set[str]:
+        memory.sum([torch.ones(100_000)], 1.0)
         maps = Path("/proc/self/maps").read_text()
-        return tuple(re.findall(r"rw-s .* (/(?:memfd:|dev/shm/(?!sem\.)).*)", maps))
+        return set(re.findall(r"rw-s .* (/(?:memfd:|dev/shm/(?!sem\.)).*)", maps))
 
-    assert in_processes(2, work) == dict.fromkeys(range(2), ("/memfd:ventosa (deleted)",))
+    assert in_processes(2, work) == dict.fromkeys(range(2), ONLY_IN_MEMORY)
+
+
+def test_a_pool_has_everyones_rows_by_rank_and_is_filled_anew() -> None:
+    """Ranks have more rows or fewer, none at all among them, and rows may hold nothing."""
+    counts = [3, 0, 5]
+
+    def work(rank: int, memory: SharedMemory) -> Any:
+        found = []
+        for turn in (1, 40, 2):
+            rows = torch.full((turn * counts[rank], 2, 1), 10 * turn + rank, dtype=torch.uint16)
+            numbers = torch.full((turn * counts[rank],), 0.5 * rank)
+            pooled = memory.pool([rows, torch.empty(len(rows), 0), numbers])
+            found.append([(tensor.dtype, tensor.shape, tensor.tolist()) for tensor in pooled])
+        return found
+
+    def expected(turn: int) -> list[Any]:
+        owners = [rank for rank, count in enumerate(counts) for _ in range(turn * count)]
+        rows = [[[10 * turn + owner]] * 2 for owner in owners]
+        return [
+            (torch.uint16, (8 * turn, 2, 1), rows),
+            (torch.float32, (8 * turn, 0), [[]] * (8 * turn)),
+            (torch.float32, (8 * turn,), [0.5 * owner for owner in owners]),
+        ]
+
+    everything = [expected(turn) for turn in (1, 40, 2)]
+    assert list(in_processes(3, work).values()) == [everything] * 3
