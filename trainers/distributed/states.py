@@ -26,11 +26,16 @@ def joined(states: Sequence[Mapping[str, Any]], axes: Axes) -> dict[str, Any]:
     """The state of all environments.
 
     Args:
-        states: those of the processes, by rank.
+        states: those of the processes, by rank; of all but the first what is `differing`.
         axes: of the environments. What comes before the second axis is time, whose latest entry is
             the last: where there is more of it in one state, it is 0 in the others.
     """
     return {name: _joined([state[name] for state in states], axes.get(name)) for name in states[0]}
+
+
+def differing(state: Mapping[str, Any], axes: Axes) -> dict[str, Any]:
+    """What of a state is not alike in all processes; the rest is None."""
+    return {name: _differing(value, axes.get(name)) for name, value in state.items()}
 
 
 def divided(state: Mapping[str, Any], axes: Axes, share: Share) -> dict[str, Any]:
@@ -57,6 +62,12 @@ def _joined(values: Sequence[Any], axes: Any) -> Any:
         arrays = [_padded(array, longest) for array in arrays]
     whole = np.concatenate(arrays, axis=axes)
     return torch.from_numpy(whole) if isinstance(first, Tensor) else whole
+
+
+def _differing(value: Any, axes: Any) -> Any:
+    if isinstance(axes, Mapping) and isinstance(value, Mapping):
+        return differing(value, axes)
+    return None if axes is None else value
 
 
 def _divided(value: Any, axes: Any, share: Share) -> Any:

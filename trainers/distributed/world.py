@@ -21,7 +21,7 @@ from trainers.common.errors import Failure, NonFiniteError, UserError
 from trainers.common.origin import is_told
 from trainers.common.share import Share
 from trainers.common.stopping import StopRequested
-from trainers.distributed.states import Axes, divided, joined
+from trainers.distributed.states import Axes, differing, divided, joined
 
 Value = TypeVar("Value")
 
@@ -235,7 +235,8 @@ class Ranks(World):
 
     def state(self, state: Mapping[str, Any], axes: Axes) -> Mapping[str, Any]:
         """See `World.state`."""
-        return joined(self.gather(state), axes)
+        # What is alike everywhere, as an optimizer's, is told by the first alone.
+        return joined(self.gather(differing(state, axes) if self.rank else state), axes)
 
     def own(self, state: Mapping[str, Any], axes: Axes, share: Share) -> Mapping[str, Any]:
         """See `World.own`."""

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from trainers.common.share import Share
-from trainers.distributed.states import EACH, divided, joined
+from trainers.distributed.states import EACH, differing, divided, joined
 
 AXES = {"reward": 0, "env": {"actions": 1, "views": 0}, "hidden": 0, "buffer": EACH}
 
@@ -28,7 +28,9 @@ def state(first: int, count: int, time: int) -> dict:
 
 
 def test_states_are_put_together_by_environment_and_the_latest_steps_are_kept_last() -> None:
-    whole = joined([state(0, 2, 3), state(2, 1, 1)], AXES)
+    second = differing(state(2, 1, 1), AXES)
+    assert second["optimizer"] is second["env"]["seed"] is None
+    whole = joined([state(0, 2, 3), second], AXES)
     assert whole["reward"].tolist() == [0.5, 1.5, 2.5]
     assert whole["env"]["actions"].tolist() == [[0, 1, 0], [10, 11, 0], [20, 21, 22]]
     assert whole["env"]["views"]["camera"]["position"].tolist() == [[0], [1], [2]]
