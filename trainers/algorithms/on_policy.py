@@ -133,7 +133,9 @@ class OnPolicyAlgorithm:
     def collect(self) -> None:
         """See `Algorithm.collect`."""
         rollout = self._collector.collect(self._gamma, self._lambd)
-        self._rollout = rollout.against_other_tries() if self._compares_tries else rollout
+        if self._compares_tries:
+            rollout = rollout.against_other_tries()
+        self._rollout = rollout.pooled(self._env_runner.world)
 
     def state_dict(self) -> dict[str, Any]:
         """See `Algorithm.state_dict`."""
@@ -159,17 +161,23 @@ class OnPolicyAlgorithm:
 
     def _show(self, rollout: Rollout) -> None:
         """Shows all processes' vector observations to the encoders that standardise."""
-        all_rows = self._env_runner.all_rows
-        self.policy.update_statistics({k: all_rows(own) for k, own in rollout.vectors.items()})
+        vectors = {name: self._all_rows(rollout, own) for name, own in rollout.vectors.items()}
+        self.policy.update_statistics(vectors)
 
     def _explained_variance(self, rollout: Rollout) -> float:
         """Of all processes' returns."""
-        all_rows = self._env_runner.all_rows
-        return explained_variance(all_rows(rollout.returns), all_rows(rollout.values))
+        returns, values = (self._all_rows(rollout, x) for x in (rollout.returns, rollout.values))
+        return explained_variance(returns, values)
 
-    def _normalized(self, advantages: Tensor) -> Tensor:
-        """One's own, by the mean and the deviation of those of all processes."""
-        return normalize(advantages, self._env_runner.all_rows(advantages))
+    def _normalized(self, rollout: Rollout) -> Tensor:
+        """Advantages, by the mean and the deviation of those of all processes."""
+        return normalize(rollout.advantages, self._all_rows(rollout, rollout.advantages))
+
+    def _all_rows(self, rollout: Rollout, rows: Tensor) -> Tensor:
+        """Everyone's (T N, ...), by step, then by environment, of a field of a rollout."""
+        if rollout.places is not None:
+            return rows[rollout.places]
+        return self._env_runner.all_rows(rows)
 
     def _optimizer_step(self, loss: Tensor, weight: float) -> Tensor:
         """One step of gradient descent, if all is finite; see `optimizer_step`.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any, ClassVar
 
@@ -142,11 +142,10 @@ class PPO(OnPolicyAlgorithm):
         """See `Algorithm.update`."""
         rollout = self._pop_rollout()
         scheduled = self._schedule(run_fraction)
-        advantages = self._normalized(rollout.advantages)
-        pooled = replace(rollout, advantages=advantages).pooled(self._env_runner.world)
+        advantages = self._normalized(rollout)
         averager = Averager()
         for _ in range(self._hyperparameters.num_epoch):
-            if not self._epoch(pooled, scheduled, averager):
+            if not self._epoch(rollout, advantages, scheduled, averager):
                 break
         self._show(rollout)
         means, hyper = self._env_runner.means(averager), self._hyperparameters
@@ -178,8 +177,14 @@ class PPO(OnPolicyAlgorithm):
         set_learning_rates(self._optimizer, learning_rates[:groups])
         return scheduled
 
-    def _epoch(self, rollout: Rollout, scheduled: _Scheduled, averager: Averager) -> bool:
-        """One pass over a rollout, its advantages normalized; False once the policy moved far."""
+    def _epoch(
+        self,
+        rollout: Rollout,
+        advantages: Tensor,
+        scheduled: _Scheduled,
+        averager: Averager,
+    ) -> bool:
+        """One pass over the rollout; False once the policy has moved far enough."""
         hyper = self._hyperparameters
         for batch in rollout.minibatches(hyper.batch_size, self._generator):
             rows = batch.rows
@@ -188,7 +193,7 @@ class PPO(OnPolicyAlgorithm):
                 distribution,
                 rollout.actions[rows],
                 rollout.log_probs[rows],
-                rollout.advantages[rows],
+                advantages[rows],
                 scheduled.epsilon,
             )
             value_loss = clipped_value_loss(

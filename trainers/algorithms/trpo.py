@@ -143,9 +143,8 @@ class TRPO(OnPolicyAlgorithm):
         delta = hyper.delta_schedule.value(hyper.delta, run_fraction)
         rate = hyper.learning_rate_schedule.value(hyper.learning_rate, run_fraction)
         set_learning_rates(self._optimizer, [rate])
-        pooled = rollout.pooled(self._env_runner.world)
-        statistics = self._improve_policy(rollout, pooled, delta)
-        statistics |= self._fit_critic(pooled)
+        statistics = self._improve_policy(rollout, delta)
+        statistics |= self._fit_critic(rollout)
         self._show(rollout)
         return statistics | {
             "Policy/Learning Rate": rate,
@@ -153,13 +152,13 @@ class TRPO(OnPolicyAlgorithm):
             "Policy/Explained Variance": self._explained_variance(rollout),
         }
 
-    def _improve_policy(self, rollout: Rollout, pooled: Rollout, delta: float) -> dict[str, float]:
+    def _improve_policy(self, rollout: Rollout, delta: float) -> dict[str, float]:
         hyper = self._hyperparameters
-        rows = rollout.in_shuffle_groups()
+        rows, weight = rollout.in_shuffle_groups()
         observations = rollout.observations(rows)
         actions, log_probs = rollout.actions[rows], rollout.log_probs[rows]
-        advantages = self._normalized(rollout.advantages)[rows]
-        mean = partial(self._env_runner.mean, weight=len(rows) / len(rollout.all_groups))
+        advantages = self._normalized(rollout)[rows]
+        mean = partial(self._env_runner.mean, weight=weight)
 
         def gain_of(distribution: Distribution) -> Tensor:
             return surrogate_gain(distribution, actions, log_probs, advantages)
@@ -174,7 +173,7 @@ class TRPO(OnPolicyAlgorithm):
             gain, divergence = mean([gain_of(new), old.kl(new).mean()])
             return gain, divergence
 
-        step = self._step(pooled, gradient, delta)
+        step = self._step(rollout, gradient, delta)
         search = line_search(
             measure,
             self._theta,

@@ -117,9 +117,9 @@ class Rollout:
             )
         return replace(self, advantages=leave_one_out(self.returns, self.frame_index))
 
-    def in_shuffle_groups(self) -> Tensor:
-        """All rows (M,), those of one group side by side and in the order of time."""
-        return self.shuffle_groups.argsort(stable=True)
+    def in_shuffle_groups(self) -> Minibatch:
+        """All transitions at once, those of one group side by side and in the order of time."""
+        return self._own(self.all_groups.argsort(stable=True))
 
     def minibatches(self, size: int, generator: torch.Generator) -> Iterator[Minibatch]:
         """Splits all transitions at random into parts of `size`; the last may be smaller.
@@ -133,12 +133,15 @@ class Rollout:
         place = torch.randperm(count, generator=generator, device=device)
         order = torch.argsort(place[self.all_groups], stable=True)
         for rows in order.split(size):
-            if self.places is None:
-                yield Minibatch(*self.share.own(rows))
-                continue
-            part = self.share.part(rows, self.all_groups[rows])
-            some = part if len(part) else rows[:1]
-            yield Minibatch(self.places[some], len(part) / len(rows))
+            yield self._own(rows)
+
+    def _own(self, rows: Tensor) -> Minibatch:
+        """What this process learns from of some transitions (B,) of all environments."""
+        if self.places is None:
+            return Minibatch(*self.share.own(rows))
+        part = self.share.part(rows, self.all_groups[rows])
+        some = part if len(part) else rows[:1]
+        return Minibatch(self.places[some], len(part) / len(rows))
 
     def pooled(self, world: World) -> Rollout:
         """Everyone's transitions where memory is shared, else one's own; valid until the next pool.

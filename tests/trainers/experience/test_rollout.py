@@ -130,7 +130,7 @@ SEQUENCES = torch.tensor([0, 1, 2, 0, 1, 2, 3, 1, 2, 3, 4, 2, 3, 4, 2])
 
 def test_sequences_come_in_the_order_of_time_with_what_was_remembered_before_them() -> None:
     rollout = rollout_of(torch.arange(15), shuffle_groups=SEQUENCES)
-    rows = rollout.in_shuffle_groups()
+    rows = rollout.in_shuffle_groups().rows
     assert rows.tolist() == [0, 3, 1, 4, 7, 2, 5, 8, 11, 14, 6, 9, 12, 10, 13]
     sequences = rollout.observations(rows).sequences
     assert sequences is not None

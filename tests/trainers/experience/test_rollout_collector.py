@@ -331,7 +331,7 @@ def test_sequences_run_again_from_their_stored_states_say_what_was_kept(
         for size in (4, len(rollout)):
             for rows, _ in rollout.minibatches(size, generator):
                 is_what_the_policy_says(rollout, policy, rows)
-        is_what_the_policy_says(rollout, policy, rollout.in_shuffle_groups())
+        is_what_the_policy_says(rollout, policy, rollout.in_shuffle_groups().rows)
         forgotten = policy(Observations({}, rollout.vectors))[1]
         assert not torch.allclose(forgotten, rollout.values, atol=1e-3)
 
@@ -387,7 +387,7 @@ def test_with_memory_too_a_frame_is_kept_once(
     (probe,) = policy.actor.frame_encoders.values()
     assert isinstance(probe, Probe)
     probe.shown.clear()
-    is_what_the_policy_says(rollout, policy, rollout.in_shuffle_groups())
+    is_what_the_policy_says(rollout, policy, rollout.in_shuffle_groups().rows)
     assert len(probe.shown) == len(set(probe.shown)) == 5 + 2 + 3
 
 
