@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import benchmarks.ranks.__main__ as command
 from benchmarks.ranks.model import Measured, Model, Network, expected_maximum, own_deviation
 
 MODEL = Model(
@@ -91,3 +92,31 @@ def test_what_was_measured_is_the_median_of_all_rounds(tmp_path: Path) -> None:
         path.write_text(json.dumps({"turns": turns, **told, **rest}))
     found = Measured.read(paths)
     assert (found.together_s, found.sums, found.sum_s) == (2.0, 3, {4: 1.5})
+
+
+def test_the_page_has_what_was_measured_and_what_is_predicted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = tmp_path / "scale.md"
+    page.write_text("before\n<!-- ranks -->\nold\n<!-- end of ranks -->\nafter\n")
+    monkeypatch.setattr(command, "usable_cores", lambda: 2)
+    monkeypatch.setattr(command, "measure", lambda *_: {k: measured(k) for k in (1, 2, 4)})
+    assert command.main(["--counts", "1", "2", "4", "--page", str(page)]) == 0
+    lines = page.read_text().splitlines()
+    assert (lines[0], lines[-1], "old" in lines) == ("before", "after", False)
+    rows = {cells[1].strip(): cells[2:-1] for line in lines if len(cells := line.split("|")) > 3}
+    together_ms = 1e3 * MODEL.update_s(2, 2)
+    assert [float(cell) for cell in (rows["2"][0], rows["2"][-1])] == [round(together_ms)] * 2
+    assert rows["2"][1].strip() == f"{500 / together_ms:.0%}"
+    assert rows["4"][1].strip() == f"{2 * 0.5 / MODEL.update_s(4, 2):.0%}"  # of two cores
+    assert rows["2"][-2].strip() == "0.60"
+    assert rows["64"][0].strip() == f"{MODEL.efficiency(64):.0%}"
+    efficiencies = [float(cell.strip(" %")) for cell in rows["1,024"]]
+    assert efficiencies[0] > efficiencies[2] > efficiencies[1]
+
+
+def test_one_rank_and_several_are_needed(capsys: pytest.CaptureFixture[str]) -> None:
+    for counts in (["1"], ["2", "4"]):
+        with pytest.raises(SystemExit):
+            command.main(["--counts", *counts])
+        assert "--counts: one rank, and several" in capsys.readouterr().err
