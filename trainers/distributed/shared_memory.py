@@ -14,6 +14,7 @@ import pickle
 import socket
 import struct
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,7 @@ def connected_sockets(
         with made() as listener:
             listener.bind("")  # to a name that the system chooses, and that is no file
             listener.listen(size)
+            listener.settimeout(timeout_s)
             first(listener.getsockname())
             peers = [listener.accept()[0] for _ in range(size - 1)]
     for peer in peers:
@@ -151,6 +153,9 @@ class SharedMemory:
     def close(self) -> None:
         """Lets the others notice that this process exchanges nothing any more."""
         for peer in self._peers:
+            # An environment's process may have got the socket, too, and keep it open.
+            with suppress(OSError):
+                peer.shutdown(socket.SHUT_RDWR)
             peer.close()
 
     def _make_room(self, length: int) -> None:
