@@ -33,11 +33,11 @@ NETWORKS = (
     Network("10 Gbit/s, 50 us", 50e-6, 1.25e9),
     Network("100 Gbit/s, 10 us", 10e-6, 12.5e9),
 )
-HEAD = (
-    *("ranks", "update", "efficiency", "of apart", "collection", "learning", "sums", "gathers"),
-    *("waiting", "a sum", "model"),
+ROWS = (
+    *("all of it", "as the model has it", "efficiency", "of apart"),
+    *("collection", "learning", "sums", "gathers", "waiting", "a sum"),
 )
-"""Times are in milliseconds."""
+"""Of the table, in milliseconds of an update where they are times."""
 
 
 @tells_failures
@@ -46,14 +46,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
     measured = measure(options.counts, options.rounds, options.updates)
     model = Model.fit(measured, usable_cores())
-    rows = [row(ranks, measured, model) for ranks in measured]
+    head = ["ms an update, of ranks", *(str(ranks) for ranks in measured)]
+    columns = [column(ranks, measured, model) for ranks in measured]
+    rows = list(zip(ROWS, *columns, strict=True))
     lines = [*told(measured, model), ""]
     ahead = predictions(model)
     console = Console()
-    console.print(table("the same work a rank, ms", HEAD, rows), *lines, sep="\n")
-    console.print(table("as the model has it, a core each", *ahead))
+    console.print(table("the same work a rank", head, rows), *lines, sep="\n")
+    console.print(table("as the model has it", *ahead))
     if options.page is not None:
-        write_between(options.page, "ranks", [*markdown(HEAD, rows), "", *lines, *markdown(*ahead)])
+        write_between(options.page, "ranks", [*markdown(head, rows), "", *lines, *markdown(*ahead)])
     return 0
 
 
@@ -97,19 +99,18 @@ def start(count: int, path: Path, updates: int) -> None:
     )
 
 
-def row(ranks: int, measured: Mapping[int, Measured], model: Model) -> list[str]:
-    """What was measured of so many ranks, in milliseconds of an update."""
+def column(ranks: int, measured: Mapping[int, Measured], model: Model) -> list[str]:
+    """`ROWS` of so many ranks."""
     found, one = measured[ranks], measured[1]
     turns = max(1.0, ranks / model.cores)
     parts = (found.collection_s, found.learning_s, found.sums_s, found.gathers_s, found.waiting_s)
     return [
-        str(ranks),
         f"{1e3 * found.together_s:.0f}",
+        f"{1e3 * model.update_s(ranks, model.cores):.0f}",
         f"{turns * one.together_s / found.together_s:.0%}",
         f"{found.apart_s / found.together_s:.0%}",
         *(f"{1e3 * part:.0f}" for part in parts),
         f"{1e3 * found.sums_s / found.sums:.2f}" if found.sums else "",
-        f"{1e3 * model.update_s(ranks, model.cores):.0f}",
     ]
 
 

@@ -20,7 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.ranks.shape import BATCH, EPISODE_STEPS
+ENVS, BUFFER, BATCH = 64, 2_048, 256
+"""Of each rank."""
+EPISODE_STEPS = 10
+"""Of the run file: actions that are tried at an image, unless one succeeds."""
 
 
 @dataclass(frozen=True)

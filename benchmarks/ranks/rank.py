@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.command import ROOT
-from benchmarks.ranks.shape import BATCH, BUFFER, ENVS
+from benchmarks.ranks.model import BATCH, BUFFER, ENVS
 from trainers.common import process
 from trainers.common.timers import Timer, recording, timed
 from trainers.distributed.processes import connected
