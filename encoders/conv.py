@@ -60,7 +60,14 @@ class ConvolutionalEncoder(nn.Module):
 
     def forward(self, raw: torch.Tensor) -> torch.Tensor:
         """Raw images (B, H, W, C) -> features (B, features_dim) float32."""
-        return self.convolutions(self.input(raw)).flatten(1)
+        *layers, activation = self.convolutions
+        maps = self.input(raw)
+        for layer in layers:
+            maps = layer(maps)
+        # Flattened first, for the gradient comes from the trunk in that order: an activation whose
+        # output lies channels_last would go through the two number by number.
+        features: torch.Tensor = activation(maps.flatten(1))
+        return features
 
 
 class Conv(ConvolutionalEncoder):

@@ -67,10 +67,18 @@ class DepthInput(ImageInput):
     def scale(self, raw: torch.Tensor) -> torch.Tensor:
         """Raw depths to [0, 1] over the camera's range, and where they are depths."""
         min_m, max_m = self.space.range_m
-        metres = self.space.decode_seen(raw)
-        seen = metres.isfinite().float() if self.validity_channel else None
-        scaled = metres.clamp_(max=max_m).sub_(min_m).mul_(1.0 / (max_m - min_m))
-        return scaled if seen is None else torch.cat([scaled, seen], dim=-1)
+        first, span_m = self.space.codes[0], max_m - min_m
+        # Straight from the codes and in place, for every pass over all pixels counts. What is
+        # beyond the last code needs none of its own: it is clamped with all that is far.
+        scaled = raw.to(torch.float32, copy=True)
+        F.threshold(scaled, first - 0.5, math.inf, inplace=True)
+        scaled.mul_(1.0 / (self.space.codes_per_m * span_m))
+        if offset_m := self.space.zero_m - min_m:
+            scaled.add_(offset_m / span_m)
+        scaled.clamp_(max=1.0)
+        if not self.validity_channel:
+            return scaled
+        return torch.cat([scaled, self.space.seen(raw).float()], dim=-1)
 
 
 class BoundedInput(ImageInput):

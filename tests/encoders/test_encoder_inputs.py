@@ -38,6 +38,16 @@ def test_depth_bytes_are_scaled_over_the_range():
     assert scaled.flatten().tolist() == pytest.approx([1, 0.2, 1], abs=1e-6)
 
 
+@pytest.mark.parametrize("range_m", [(0.4, 2.0), (0.0, 1.2345), (0.5006, 0.9)])
+@pytest.mark.parametrize("encoding", ["uint8", "uint16"])
+def test_every_code_is_scaled_as_the_depth_that_it_stands_for(encoding, range_m):
+    space = DepthImage(1, 1, range_m, encoding)
+    raw = torch.from_numpy(np.arange(np.iinfo(space.dtype).max + 1).astype(space.dtype))
+    share = (space.decode(raw).double() - range_m[0]) / (range_m[1] - range_m[0])
+    scaled = image_input(space)(raw.reshape(-1, 1, 1, 1)).flatten()
+    assert torch.allclose(scaled.double(), share, rtol=0.0, atol=1e-6)
+
+
 def test_the_validity_channel_tells_depths_from_nothing_seen():
     module = image_input(DepthImage(1, 5), validity_channel=True)
     raw = torch.from_numpy(np.array([0, 399, 400, 2000, 2001], dtype=np.uint16))
