@@ -325,7 +325,8 @@ class GraspVectorEnv(Environment):
             views=views,
             images=self._pictures(indices, views),
         )
-        whole = self._episodes is None
+        # Where all begin anew, nothing of the others is left to be copied.
+        whole = n == self.num_envs
         self._episodes = begun if whole else self._running().with_rows(indices, begun)
 
     def _pictures(

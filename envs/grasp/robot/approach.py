@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from envs.grasp.robot.kinematics import ArmLengths, arm_lengths, solve_frame, wi
 from envs.grasp.robot.paths import Floats, Path
 from envs.grasp.robot.urdf import Robot
 from envs.grasp.settings import MAX_STANDOFF_M
+from envs.grasp.simulators.thread_pool import ThreadPool
 
 # Over the default workspace, parabolas of such a length leave the straight line by 0.3 mm and 0.07
 # deg at most, and by 0.03 mm on average.
@@ -43,6 +45,7 @@ class Approach:
         self._arm, self._last_link = arm_lengths(robot), np.linalg.inv(robot.tooltip)
         self._lower_rad, self._upper_rad = robot.lower_rad, robot.upper_rad
         self._standoff_m = standoff_m
+        self._threads = ThreadPool()
         self.knots = 2 * max(1, math.ceil(standoff_m / LEG_M - 1e-9)) + 1
 
     def __call__(self, tooltip_m: Floats, yaw_rad: Floats) -> tuple[Path, Floats]:
@@ -58,7 +61,8 @@ class Approach:
         """
         n = len(yaw_rad)
         ways, length_m = np.empty((n, self.knots, 6)), np.empty(n)
-        _solve(
+        solve = partial(
+            _solve,
             self._arm,
             self._last_link,
             self._lower_rad,
@@ -69,10 +73,11 @@ class Approach:
             ways,
             length_m,
         )
+        self._threads.parallel_for(solve, n)
         return ways, length_m
 
 
-@compiled()
+@compiled(nogil=True)
 def _solve(
     arm: ArmLengths,
     last_link: np.ndarray,
@@ -83,10 +88,12 @@ def _solve(
     standoff: float,
     ways: np.ndarray,
     length: np.ndarray,
+    begin: int,
+    end: int,
 ) -> None:
-    """Writes the ways (n, k, 6) to poses, and their lengths (n,)."""
+    """Writes the ways (n, k, 6) to poses and their lengths (n,), in the rows from begin to end."""
     frame, last = np.empty((4, 4)), ways.shape[1] - 1
-    for row in range(len(ways)):
+    for row in range(begin, end):
         way, tip, angle = ways[row], tooltip[row], yaw[row]
         reached = _reach(arm, last_link, lower, upper, tip, angle, 0.0, frame, way[last])
         far = standoff if reached else 0.0

@@ -98,7 +98,7 @@ def take_pictures(
             sense(picture.inverse, True, sensor, row, bench, codes[row])
 
 
-@kernel()
+@kernel(counts=False)
 def _to_color(packed: NDArray[np.int32], color: NDArray[np.uint8]) -> None:
     for pixel in range(len(color)):
         color[pixel, 0] = packed[pixel] >> 16
@@ -106,14 +106,14 @@ def _to_color(packed: NDArray[np.int32], color: NDArray[np.uint8]) -> None:
         color[pixel, 2] = packed[pixel] & 255
 
 
-@kernel(fastmath=FAST)
+@kernel(counts=False, fastmath=FAST)
 def _to_depth(inverse: NDArray[np.float32], depth: NDArray[np.float32]) -> None:
     for pixel in range(len(depth)):
         value = inverse[pixel]
         depth[pixel] = np.float32(1.0) / value if value > np.float32(0.0) else np.float32(np.inf)
 
 
-@kernel()
+@kernel(counts=False)
 def _draw_world(
     picture: Canvas,
     robot: RobotArrays,
@@ -124,8 +124,10 @@ def _draw_world(
     frames: Floats,
 ) -> None:
     """Draws everything in a world; `frames` (L, 3, 4) is room for the robot's links."""
-    picture.inverse[:] = 0.0
-    picture.colors[:] = WHITE
+    for pixel in range(len(picture.inverse)):
+        picture.inverse[pixel] = 0.0
+    for pixel in range(len(picture.colors)):
+        picture.colors[pixel] = WHITE
     lens = Lens(
         views.intrinsics[row, 0],
         views.intrinsics[row, 1],
@@ -165,7 +167,7 @@ def _draw_world(
     _draw_robot(picture, robot, worlds, world, eye, lens, light, frames)
 
 
-@kernel()
+@kernel(counts=False)
 def _draw_robot(
     picture: Canvas,
     robot: RobotArrays,
@@ -203,13 +205,13 @@ def _draw_robot(
             draw_box(picture, center, x_axis, y_axis, z_axis, half, color, lens, light)
 
 
-@kernel()
+@kernel(counts=False)
 def _turned(eye: Eye, direction: Vector) -> Vector:
     """A direction of the world in the axes of a camera."""
     return dot(eye.right, direction), dot(eye.down, direction), dot(eye.forward, direction)
 
 
-@kernel()
+@kernel(counts=False)
 def _placed(eye: Eye, point: Vector) -> Vector:
     """A point of the world in the axes of a camera."""
     return _turned(eye, minus(point, eye.position))

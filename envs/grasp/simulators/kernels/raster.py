@@ -27,7 +27,7 @@ Colors = NDArray[np.int32]
 FAST = {"contract", "reassoc", "nsz", "arcp", "afn"}
 # Loops over a multiple of so many pixels become vectors without a slow remainder; what is drawn
 # into has so many pixels behind its end.
-LANES = 8
+LANES = 16
 # A pixel whose centre lies on an edge is drawn by both its faces, rather than by none.
 EDGE_SLACK_PX = 1e-6
 PARALLEL = 1e-14
@@ -112,7 +112,7 @@ def canvas(height: int, width: int, colored: bool) -> Canvas:
     )
 
 
-@kernel()
+@kernel(counts=False)
 def shaded(color: Vector, cosine: float, light: Light) -> int:
     """A color in [0, 255] whose normal has this cosine to the light, packed as 0xRRGGBB."""
     intensity = light.ambient + light.diffuse * max(0.0, cosine)
@@ -121,7 +121,7 @@ def shaded(color: Vector, cosine: float, light: Light) -> int:
     return (red << 16) | (green << 8) | min(255, int(color[2] * intensity))
 
 
-@kernel()
+@kernel(counts=False)
 def in_sight(center: Vector, radius: float, lens: Lens) -> bool:
     """Whether a ball reaches into the frustum's six half spaces."""
     x, y, z = center
@@ -135,13 +135,13 @@ def in_sight(center: Vector, radius: float, lens: Lens) -> bool:
     )
 
 
-@kernel()
+@kernel(counts=False)
 def _inside(x: float, z: float, tangent: float, radius: float) -> bool:
     """Whether a ball at x to the side reaches into the half space x <= tangent * z."""
     return x - tangent * z <= radius * math.sqrt(1.0 + tangent * tangent)
 
 
-@kernel()
+@kernel(counts=False)
 def _covered(
     center: Vector, x_axis: Vector, y_axis: Vector, z_axis: Vector, half: Vector, lens: Lens
 ) -> Rectangle:
@@ -170,14 +170,14 @@ def _covered(
     )
 
 
-@kernel()
+@kernel(counts=False)
 def _slab(axis: Vector, center: Vector, half: float, lens: Lens) -> Slab:
     right, down = axis[0] / lens.fx, axis[1] / lens.fy
     start = axis[2] + (0.5 - lens.cx) * right + (0.5 - lens.cy) * down
     return Slab(right, down, start, dot(axis, center), half)
 
 
-@kernel()
+@kernel(counts=False)
 def _cut(lines: Floats, edge: int, right: float, down: float, start: float) -> None:
     """Notes where a row's span begins or ends: right * column + down * row + start >= 0."""
     if abs(right) < PARALLEL:
@@ -192,7 +192,7 @@ def _cut(lines: Floats, edge: int, right: float, down: float, start: float) -> N
         lines[2, edge], lines[3, edge] = slope, offset + EDGE_SLACK_PX
 
 
-@kernel(fastmath=FAST)
+@kernel(counts=False, fastmath=FAST)
 def _cut_rows(lines: Floats, lows: Floats, highs: Floats, rows: Rectangle, width: int) -> None:
     """Spans of the rows from the face's six edges, which are unrolled to become vectors."""
     a0, a1, a2, a3, a4, a5 = (lines[0, 0], lines[0, 1], lines[0, 2], lines[0, 3], lines[0, 4], lines[0, 5])  # fmt: skip # noqa: E501
@@ -211,7 +211,7 @@ def _cut_rows(lines: Floats, lows: Floats, highs: Floats, rows: Rectangle, width
         lows[i], highs[i] = low, high
 
 
-@kernel(fastmath=FAST)
+@kernel(counts=False, fastmath=FAST)
 def _fill(
     inverse: Pixels, lows: Floats, highs: Floats, plane: Vector, rows: Rectangle, width: int
 ) -> None:
@@ -246,7 +246,7 @@ def _fill(
             inverse[offset + i] = here if here > old else old
 
 
-@kernel(fastmath=FAST)
+@kernel(counts=False, fastmath=FAST)
 def _fill_colored(
     inverse: Pixels,
     colors: Colors,
@@ -278,7 +278,7 @@ def _fill_colored(
             colors[offset + i] = paint if here > old else before
 
 
-@kernel()
+@kernel(counts=False)
 def _draw_face(
     picture: Canvas,
     across: Slab,
@@ -312,7 +312,7 @@ def _draw_face(
         _fill(picture.inverse, lows, highs, plane, rows, lens.width)
 
 
-@kernel()
+@kernel(counts=False)
 def draw_box(
     picture: Canvas,
     center: Vector,
@@ -352,7 +352,7 @@ def draw_box(
         x_axis, y_axis, z_axis = y_axis, z_axis, x_axis
 
 
-@kernel()
+@kernel(counts=False)
 def draw_cylinder(
     picture: Canvas,
     center: Vector,
@@ -381,7 +381,7 @@ def draw_cylinder(
             _shade_row(picture, covered, row, center, color, lens, light)
 
 
-@kernel(fastmath=FAST)
+@kernel(counts=False, fastmath=FAST)
 def _cylinder_row(
     picture: Canvas,
     covered: Rectangle,
@@ -432,7 +432,7 @@ def _cylinder_row(
             picture.colors[offset + i] = UNSHADED if here > old else before
 
 
-@kernel()
+@kernel(counts=False)
 def _shade_row(
     picture: Canvas,
     covered: Rectangle,
