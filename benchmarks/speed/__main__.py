@@ -3,7 +3,8 @@
 Simulators and environments are compared with PyBullet's, the training loop with Stable-Baselines3's
 PPO on the same environment. All are measured in turn in one run: the median over the rounds counts,
 and the slowest and the fastest round are shown beside it. All of it takes about an hour, most of
-which is training on the largest images; `--sizes 80` takes minutes.
+which is training on the largest images; `--sizes 80` takes minutes. The part `limits` compares the
+simulator's pieces and the updates with what the machine can do, in some two minutes.
 
 With `--device cuda` the run files of `config/` are measured on the CPU and on that device instead,
 in some three minutes.
@@ -25,7 +26,7 @@ from benchmarks.command import EXTRA, missing
 from trainers.common import process
 from trainers.common.command import require_extra, tells_failures
 
-PARTS = ("simulator", "environment", "training", "memory", "runs")
+PARTS = ("simulator", "environment", "training", "memory", "runs", "limits")
 SIZES = (32, 80, 128, 256)
 # A batch is 512 transitions, and there are 32 of each environment in a buffer.
 MIN_ENVS = 16

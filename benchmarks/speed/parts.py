@@ -9,6 +9,7 @@ from rich.table import Table
 
 from benchmarks.command import missing
 from benchmarks.speed.figures import MODES, Figures, growth, speedup
+from benchmarks.speed.limits import table_of_limits
 from benchmarks.speed.processes import peak_mib, start_s
 from benchmarks.speed.runs import table_of_runs
 from benchmarks.speed.simulation import FRAMES, frames, steps
@@ -77,12 +78,18 @@ def runs(options: argparse.Namespace) -> Table:
     return table_of_runs(options.device, options.seconds)
 
 
+def limits(options: argparse.Namespace) -> Table:
+    """Times of the simulator's pieces and of updates, beside what the machine can do."""
+    return table_of_limits(options.seconds)
+
+
 PARTS = {
     "simulator": simulator,
     "environment": environment,
     "training": train,
     "memory": memory,
     "runs": runs,
+    "limits": limits,
 }
 
 

@@ -14,6 +14,7 @@ from benchmarks.speed.figures import FAST, MODES, PYBULLET, Figures, race, rate
 from encoders.spaces import DepthImage
 from envs.grasp.env import built_in_rewards, make_vector_env
 from envs.grasp.observations import observation_space, picture_seeds
+from envs.grasp.scene.sampler import SceneSampler
 from envs.grasp.settings import Camera, GraspSettings
 from envs.grasp.simulators.factory import make_simulator
 from envs.grasp.vector_env import GraspVectorEnv
@@ -38,7 +39,8 @@ def frames(kind: str, size: int, num_worlds: int, rounds: int, seconds: float) -
     with ExitStack() as stack:
         measures = {}
         for name in (FAST, PYBULLET):
-            worlds = _Worlds(name, kind, size, num_worlds)
+            camera = Camera.model_validate({"type": kind, "width": size, "height": size})
+            worlds = Worlds(name, camera, num_worlds)
             stack.callback(worlds.simulator.close)
             rate(worlds.shoot, 0.0, worlds.change)  # compiles, and starts processes
             measures[name, num_worlds] = partial(
@@ -87,31 +89,43 @@ def _play(env: GraspVectorEnv, rng: np.random.Generator) -> int:
     return EPISODE_STEPS * env.num_envs
 
 
-class _Worlds:
-    """Worlds before one kind of camera, with something new in view at every picture."""
+class Worlds:
+    """Worlds before one camera, with something new in view at every picture."""
 
-    def __init__(self, simulator: str, kind: str, size: int, num_worlds: int):
-        camera = Camera.model_validate({"type": kind, "width": size, "height": size})
+    def __init__(self, simulator: str, camera: Camera, num_worlds: int):
+        kind = camera.type
         settings = GraspSettings.model_validate(
             {"simulator": simulator, "num_envs": num_worlds, "cameras": {kind: camera}}
         )
         self.simulator = make_simulator(settings, ROBOT, num_worlds)
-        self._sample = Sample(num_worlds, (size, size))
-        self._views = self._sample.views[kind]
+        self._sample = sample = Sample(num_worlds, (camera.width, camera.height))
+        limits = np.full(num_worlds, np.pi)
+        sample.scenes, views = SceneSampler(settings).sample(np.random.default_rng(0), limits)
+        self._views = views[kind]
         space = observation_space(settings)[kind]
         self._space = space if isinstance(space, DepthImage) else None
         self._rng, self._pictures = np.random.default_rng(0), 0
 
     def change(self) -> None:
         """Moves all robots, after new scenes where an episode would begin."""
+        self.plan()
+        self.move()
+
+    def plan(self) -> None:
+        """Begins new scenes where an episode would begin, and plans the next motions."""
         sample = self._sample
         if self._pictures % EPISODE_STEPS == 0:
             order = self._rng.permutation(len(sample.scenes))
             sample.scenes, self._views = sample.scenes[order], self._views[order]
             self.simulator.load(sample.everywhere, sample.scenes, sample.start.joints_rad)
-        (path,) = sample.paths(1)
-        self.simulator.move(sample.everywhere, path, RESOLUTION_M)
+        (self._path,) = sample.paths(1)
         self._pictures += 1
+
+    def move(self) -> int:
+        """Moves all robots as planned; returns how many."""
+        everywhere = self._sample.everywhere
+        self.simulator.move(everywhere, self._path, RESOLUTION_M)
+        return len(everywhere)
 
     def shoot(self) -> int:
         """Takes a picture of every world, depth as the sensor delivers it; returns how many."""
