@@ -21,6 +21,7 @@ MIN_CONTACT_RESOLUTION_M = 1e-6
 # Well under the thinnest bar of a block, so that nothing is passed through.
 MAX_CONTACT_RESOLUTION_M = 0.02
 MAX_GOAL_M, MAX_GOAL_DEG = 100.0, 360.0
+MAX_YAW_DEG = 180.0
 MAX_NOISE_SIGMA_M = 1.0
 # About as far as the arm can go straight ahead at all.
 MAX_STANDOFF_M = 1.0
@@ -189,6 +190,15 @@ class Workspace(BaseModel, frozen=True, extra="forbid"):
         for name, (low, high) in self:
             if low == high:
                 raise ValueError(f"{name} [{low}, {high}] has no width, so no action could vary it")
+        return self
+
+    @model_validator(mode="after")
+    def _turns_once_at_most(self) -> Workspace:
+        if max(map(abs, self.yaw_deg)) > MAX_YAW_DEG:
+            raise ValueError(
+                f"yaw_deg {list(self.yaw_deg)}: keep it within +-{MAX_YAW_DEG:g}, which is all "
+                "around"
+            )
         return self
 
 

@@ -46,6 +46,21 @@ def test_numbers_that_are_not_finite_are_refused(path: tuple[str, ...], value: l
     assert ".".join(path) in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ({"x_m": (1.0, 1.0)}, r"x_m \[1.0, 1.0\] has no width"),
+        ({"yaw_deg": (-40.0, 1e9)}, r"yaw_deg \[-40.0, 1000000000.0\]: keep it within \+-180"),
+    ],
+)
+def test_workspaces_that_no_action_covers_are_refused(
+    section: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValidationError, match=message):
+        GraspSettings.model_validate({"workspace": section})
+    assert GraspSettings.model_validate({"workspace": {"yaw_deg": (-180.0, 180.0)}})
+
+
 def test_a_micrometre_is_fine_enough() -> None:
     assert GraspSettings(contact_resolution_m=1e-6).contact_resolution_m == 1e-6
 
