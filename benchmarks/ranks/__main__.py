@@ -1,11 +1,12 @@
 """What ranks cost each other: the same work a rank on 1, 2, 4 and 8 of torchrun's processes.
 
-    python -m benchmarks.ranks [--page docs/scale.md]
+    python -m benchmarks.ranks [config/paper/stream.yaml] [--page docs/scale.md]
 
-Each rank has one thread, 64 environments of config/paper/frame_grab.yaml and 256 transitions of a
-minibatch, so that k ranks do k times what one does. In turn with updates that they make together,
-they make each its own, and tell each other nothing: what they cost each other by sharing a machine.
-A model of an update's time is fitted to it, and says what more ranks would take.
+Each rank has one thread, and of config/paper/frame_grab.yaml, or of another run file of PPO, 64
+environments and 256 transitions of a minibatch, so that k ranks do k times what one does. In turn
+with updates that they make together, they make each its own, and tell each other nothing: what they
+cost each other by sharing a machine. A model of an update's time is fitted to it, and says what
+more ranks would take.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from trainers.common.command import tells_failures
 from trainers.common.cores import usable_cores
 from trainers.comparison.tables import markdown
 
+RUN_FILE = ROOT / "config" / "paper" / "frame_grab.yaml"
 COUNTS = (1, 2, 4, 8)
 PREDICTED = (64, 1_024)
 NETWORKS = (
@@ -44,7 +46,7 @@ ROWS = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, fits, predicts, and prints it all."""
     options = parse(arguments)
-    measured = measure(options.counts, options.rounds, options.updates)
+    measured = measure(options.run_file, options.counts, options.rounds, options.updates)
     model = Model.fit(measured, usable_cores())
     head = ["ms an update, of ranks", *(str(ranks) for ranks in measured)]
     columns = [column(ranks, measured, model) for ranks in measured]
@@ -66,6 +68,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("run_file", type=Path, nargs="?", default=RUN_FILE)
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="of ranks")
     parser.add_argument("--rounds", type=int, default=2, help="of all counts, in turn")
     parser.add_argument("--updates", type=int, default=4, help="of a round, apart and together")
@@ -76,21 +79,23 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-def measure(counts: Sequence[int], rounds: int, updates: int) -> dict[int, Measured]:
+def measure(
+    run_file: Path, counts: Sequence[int], rounds: int, updates: int
+) -> dict[int, Measured]:
     """Starts the processes of each count in turn, so that what else happens meets all alike."""
     with tempfile.TemporaryDirectory() as folder:
         paths = {k: [Path(folder, f"{k}-{turn}.json") for turn in range(rounds)] for k in counts}
         for turn in range(rounds):
             for count in counts:
-                start(count, paths[count][turn], updates)
+                start(run_file, count, paths[count][turn], updates)
         return {count: Measured.read(paths[count]) for count in counts}
 
 
-def start(count: int, path: Path, updates: int) -> None:
+def start(run_file: Path, count: int, path: Path, updates: int) -> None:
     """Has so many ranks measure, each with one thread, and write it to a file."""
     launch = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", str(count)]
     rendezvous = ["--rdzv-backend", "c10d", "--rdzv-endpoint", "localhost:0"]
-    rank = ["-m", "benchmarks.ranks.rank", str(path), str(updates)]
+    rank = ["-m", "benchmarks.ranks.rank", str(path), str(run_file.resolve()), str(updates)]
     subprocess.run(
         [*launch, *rendezvous, *rank],
         cwd=ROOT,

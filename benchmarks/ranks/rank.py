@@ -13,7 +13,6 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.command import ROOT
 from benchmarks.ranks.model import BATCH, BUFFER, ENVS
 from trainers.common import process
 from trainers.common.timers import Timer, recording, timed
@@ -23,7 +22,6 @@ from trainers.runfile.registry import load_registries
 from trainers.runfile.settings import load_run
 from trainers.session import Session
 
-RUN_FILE = ROOT / "config" / "paper" / "frame_grab.yaml"
 WARM_UP = 2
 SIZES = (1, 10_000, 100_000, 1_000_000)
 """Of sums, in numbers of four bytes."""
@@ -32,12 +30,16 @@ SUM, GATHER, WAIT = "all_reduce", "gather", "wait"
 """Timers of what ranks tell each other, and of waiting for those that have not come to it."""
 
 
-def main(path: Path, updates: int) -> None:
+def main(path: Path, run_file: Path, updates: int) -> None:
     """Measures so many updates, in turn apart from the others and together with them.
 
     Writes what `benchmarks.ranks.model.Measured` reads.
     """
-    with connected() as world, closing(begun(ALONE)) as own, closing(begun(world)) as session:
+    with (
+        connected() as world,
+        closing(begun(run_file, ALONE)) as own,
+        closing(begun(run_file, world)) as session,
+    ):
         for _ in range(WARM_UP):
             update(own)
             update(session)
@@ -57,8 +59,8 @@ def main(path: Path, updates: int) -> None:
             path.write_text(json.dumps(found))
 
 
-def begun(world: World) -> Session:
-    """The run of so many ranks, each with a thread."""
+def begun(run_file: Path, world: World) -> Session:
+    """A file's run of so many ranks, each with a thread."""
     overrides = {
         "environment.num_envs": ENVS * world.size,
         "environment.workers": 1,
@@ -66,7 +68,7 @@ def begun(world: World) -> Session:
         "trainer.hyperparameters.batch_size": BATCH * world.size,
     }
     registries = load_registries()
-    run = load_run(RUN_FILE, [f"{key}={value}" for key, value in overrides.items()], registries)
+    run = load_run(run_file, [f"{key}={value}" for key, value in overrides.items()], registries)
     session = Session(run, registries, world=world)
     session.reset()
     return session
@@ -135,4 +137,4 @@ def _mean(ranks: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 if __name__ == "__main__":
     process.prepare()
-    main(Path(sys.argv[1]), int(sys.argv[2]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]))
