@@ -146,10 +146,14 @@ ONLY_IN_MEMORY = frozenset({"/memfd:ventosa (deleted)"})
 def test_nothing_can_be_left_of_what_is_shared() -> None:
     """It is no file from the beginning, so that nobody need take it away, however all end."""
 
-    def work(rank: int, memory: SharedMemory) -> set[str]:
-        memory.sum([torch.ones(100_000)], 1.0)
+    def mapped() -> set[str]:
         maps = Path("/proc/self/maps").read_text()
         return set(re.findall(r"rw-s .* (/(?:memfd:|dev/shm/(?!sem\.)).*)", maps))
+
+    def work(rank: int, memory: SharedMemory) -> set[str]:
+        before = mapped()  # by other tests
+        memory.sum([torch.ones(100_000)], 1.0)
+        return mapped() - before
 
     assert in_processes(2, work) == dict.fromkeys(range(2), ONLY_IN_MEMORY)
 
