@@ -146,14 +146,15 @@ ONLY_IN_MEMORY = frozenset({"/memfd:ventosa (deleted)"})
 def test_nothing_can_be_left_of_what_is_shared() -> None:
     """It is no file from the beginning, so that nobody need take it away, however all end."""
 
-    def mapped() -> set[str]:
+    def mapped() -> set[tuple[str, str]]:
         maps = Path("/proc/self/maps").read_text()
-        return set(re.findall(r"rw-s .* (/(?:memfd:|dev/shm/(?!sem\.)).*)", maps))
+        shared = r"^(\S+) rw-s .* (/(?:memfd:|dev/shm/(?!sem\.)).*)$"
+        return set(re.findall(shared, maps, re.MULTILINE))
 
     def work(rank: int, memory: SharedMemory) -> set[str]:
-        before = mapped()  # by other tests
+        before = mapped()  # of other tests
         memory.sum([torch.ones(100_000)], 1.0)
-        return mapped() - before
+        return {name for _, name in mapped() - before}
 
     assert in_processes(2, work) == dict.fromkeys(range(2), ONLY_IN_MEMORY)
 
