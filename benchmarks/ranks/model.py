@@ -22,8 +22,6 @@ import numpy as np
 
 ENVS, BUFFER, BATCH = 64, 2_048, 256
 """Of each rank."""
-EPISODE_STEPS = 10
-"""Of the run file: actions that are tried at an image, unless one succeeds."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +41,7 @@ class Measured:
         sum_s: seconds of telling so many bytes, by how many.
         checkpoint_s: to gather what a checkpoint has of all ranks.
         checkpoint_bytes: of that.
+        tries: actions at an image, unless one succeeds.
     """
 
     apart_s: float
@@ -57,6 +56,7 @@ class Measured:
     sum_s: Mapping[int, float]
     checkpoint_s: float
     checkpoint_bytes: float
+    tries: float
 
     @classmethod
     def read(cls, paths: Sequence[Path]) -> Measured:
@@ -109,6 +109,7 @@ class Model:
         bytes_per_s: B, in shared memory.
         deviation: d.
         gathers_s: g and h.
+        tries: actions at an image.
     """
 
     cores: int
@@ -120,6 +121,7 @@ class Model:
     bytes_per_s: float
     deviation: float
     gathers_s: tuple[float, float]
+    tries: float
 
     @classmethod
     def fit(cls, measured: Mapping[int, Measured], cores: int) -> Model:
@@ -142,6 +144,7 @@ class Model:
             bytes_per_s=1.0 / told.slope,
             deviation=found.waiting_s / (found.learning_s * expected_maximum(ranks)),
             gathers_s=_line(several, gathers),
+            tries=found.tries,
         )
 
     def update_s(self, ranks: int, cores: int, network: Network | None = None) -> float:
@@ -158,7 +161,7 @@ class Model:
         sum_s, deviation = self.latency_s + self.gradient_bytes / self.bytes_per_s, self.deviation
         if network is not None:
             sum_s = network.sum_s(ranks, self.gradient_bytes)
-            deviation = math.hypot(deviation, own_deviation(ranks))
+            deviation = math.hypot(deviation, own_deviation(ranks, self.tries))
         waiting_s = self.learning_s * deviation * expected_maximum(ranks)
         gathers_s = self.gathers_s[0] + self.gathers_s[1] * ranks
         return max(1.0, ranks / cores) * (work_s + waiting_s + gathers_s) + self.sums * sum_s
@@ -168,13 +171,13 @@ class Model:
         return self.update_s(1, 1) / self.update_s(ranks, ranks, network)
 
 
-def own_deviation(ranks: int) -> float:
+def own_deviation(ranks: int, tries: float) -> float:
     """Relative deviation of how much of a minibatch is of a rank's own environments.
 
     Images of it are binomial, each with the actions tried at it. Where memory is not shared, a rank
     learns from those; what it does once in a step, however many they are, makes it a bit less.
     """
-    images = BATCH / EPISODE_STEPS
+    images = BATCH / tries
     return math.sqrt((1.0 - 1.0 / ranks) / images)
 
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -18,8 +19,8 @@ from trainers.common import process
 from trainers.common.timers import Timer, recording, timed
 from trainers.distributed.processes import connected
 from trainers.distributed.world import ALONE, Ranks, World
-from trainers.runfile.registry import load_registries
-from trainers.runfile.settings import load_run
+from trainers.runfile.registry import Registries, load_registries
+from trainers.runfile.settings import RunSettings, load_run
 from trainers.session import Session
 
 WARM_UP = 2
@@ -35,10 +36,12 @@ def main(path: Path, run_file: Path, updates: int) -> None:
 
     Writes what `benchmarks.ranks.model.Measured` reads.
     """
+    registries = load_registries()
+    alone = of_ranks(run_file, registries, ALONE.size)
     with (
         connected() as world,
-        closing(begun(run_file, ALONE)) as own,
-        closing(begun(run_file, world)) as session,
+        closing(begun(alone, registries, ALONE)) as own,
+        closing(begun(of_ranks(run_file, registries, world.size), registries, world)) as session,
     ):
         for _ in range(WARM_UP):
             update(own)
@@ -54,24 +57,33 @@ def main(path: Path, run_file: Path, updates: int) -> None:
             "sum_s": dict(sums(world)) if isinstance(world, Ranks) else {},
             "checkpoint_s": checkpoint_s,
             "checkpoint_bytes": len(pickle.dumps((session.weights(), checkpoint))),
+            "tries": tries(alone.environment.settings),
         }
         if world.writes:
             path.write_text(json.dumps(found))
 
 
-def begun(run_file: Path, world: World) -> Session:
-    """A file's run of so many ranks, each with a thread."""
-    overrides = {
-        "environment.num_envs": ENVS * world.size,
-        "environment.workers": 1,
-        "trainer.hyperparameters.buffer_size": BUFFER * world.size,
-        "trainer.hyperparameters.batch_size": BATCH * world.size,
-    }
-    registries = load_registries()
-    run = load_run(run_file, [f"{key}={value}" for key, value in overrides.items()], registries)
+def begun(run: RunSettings, registries: Registries, world: World) -> Session:
+    """A run, at its beginning."""
     session = Session(run, registries, world=world)
     session.reset()
     return session
+
+
+def of_ranks(run_file: Path, registries: Registries, ranks: int) -> RunSettings:
+    """A file's run of so many ranks, each with a thread."""
+    overrides = {
+        "environment.num_envs": ENVS * ranks,
+        "environment.workers": 1,
+        "trainer.hyperparameters.buffer_size": BUFFER * ranks,
+        "trainer.hyperparameters.batch_size": BATCH * ranks,
+    }
+    return load_run(run_file, [f"{key}={value}" for key, value in overrides.items()], registries)
+
+
+def tries(settings: Any) -> int:
+    """Actions at an image, unless one succeeds, in the environments of a run file."""
+    return settings.episode_steps if getattr(settings, "frame_grab", False) else 1
 
 
 def update(session: Session) -> Timer:
