@@ -14,6 +14,7 @@ from trainers.common.errors import UserError
 
 LOCK = "run.lock"
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+RETRIES = 1_000  # as others remove folder or file just then, each time
 
 
 class Holder(BaseModel, frozen=True):
@@ -62,9 +63,7 @@ class RunLock:
     def __init__(self, directory: Path):
         self._path = directory / LOCK
         self._made = [path for path in (directory, *directory.parents) if not path.exists()]
-        while (descriptor := self._locked()) is None:
-            pass
-        self._descriptor = descriptor
+        self._descriptor = descriptor = self._locked()
         try:
             me, before = Holder.this_process(), _read(descriptor)
             if before is not None and not before.is_near(me):
@@ -89,19 +88,30 @@ class RunLock:
             except OSError:  # something came into it
                 break
 
-    def _locked(self) -> int | None:
-        """The locked file; None if another process removed it meanwhile.
+    def _locked(self) -> int:
+        """The locked file in its folder, both made anew where another process removes them."""
+        for _ in range(RETRIES):
+            try:
+                return self._try_to_lock()
+            except (FileNotFoundError, FileExistsError):
+                # The folder, one above it or the file went while it was made, looked at or opened.
+                pass
+        return self._try_to_lock()
+
+    def _try_to_lock(self) -> int:
+        """The locked file.
 
         Raises:
             UserError: another process holds it.
+            FileNotFoundError: folder or file was removed meanwhile, or can never be made.
+            FileExistsError: the same of the folder, or a file is in its place.
         """
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-        except FileNotFoundError:
-            return None
+        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         try:
             fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not _is_at(descriptor, self._path):
+                raise FileNotFoundError(f"{self._path}: was removed by the process that held it")
         except BlockingIOError as error:
             holder = _read(descriptor) or "another process"
             os.close(descriptor)
@@ -112,10 +122,7 @@ class RunLock:
         except BaseException:
             os.close(descriptor)
             raise
-        if _is_at(descriptor, self._path):
-            return descriptor
-        os.close(descriptor)
-        return None
+        return descriptor
 
 
 def is_held(directory: Path) -> bool:

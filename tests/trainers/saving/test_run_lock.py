@@ -112,6 +112,29 @@ def test_folders_made_for_nothing_are_removed_and_others_are_not(tmp_path: Path)
     assert os.listdir(tmp_path / "there/results/run") == ["status.json"]
 
 
+@pytest.mark.parametrize("error", [FileExistsError, FileNotFoundError])
+def test_a_folder_that_went_while_it_was_made_is_made_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: type[OSError]
+) -> None:
+    mkdir, tries = Path.mkdir, []
+
+    def interrupted(folder: Path, **options: bool) -> None:
+        tries.append(folder)
+        if len(tries) <= 2:
+            raise error(folder)
+        mkdir(folder, **options)
+
+    monkeypatch.setattr(Path, "mkdir", interrupted)
+    RunLock(tmp_path / "run").close()
+    assert len(tries) == 3
+
+
+def test_a_folder_that_can_never_be_made_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "run").touch()
+    with pytest.raises(FileExistsError, match="run"):
+        RunLock(tmp_path / "run")
+
+
 def test_a_lock_that_became_anothers_is_left_to_it(tmp_path: Path) -> None:
     lock = RunLock(tmp_path)
     (tmp_path / LOCK).unlink()
