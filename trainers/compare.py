@@ -11,6 +11,7 @@ from trainers.common.command import DONE, FAILED, require_extra, tells_failures
 from trainers.common.errors import UserError
 from trainers.common.options import add_results_option, command_parser, positive
 from trainers.comparison.jobs import CORES, run_missing
+from trainers.learn import stop_on_signals
 
 
 @tells_failures
@@ -29,12 +30,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     registries = load_registries()
     # All run files are looked at before the first run begins.
     jobs = [run.job(registries) for run in planned]
-    try:
-        code = run_missing(jobs, options.jobs)
-        page = write_report(collect(planned, made), options.report or options.results_dir)
-    except OSError as error:
-        raise UserError(f"{error.filename}: can't be written: {error.strerror}") from error
+    with stop_on_signals() as stop:
+        try:
+            code = run_missing(jobs, options.jobs, stop.requested)
+            page = write_report(collect(planned, made), options.report or options.results_dir)
+        except OSError as error:
+            raise UserError(f"{error.filename}: can't be written: {error.strerror}") from error
     print(page)
+    if stop.requested():
+        return stop.exit_code
     return FAILED if code else DONE
 
 

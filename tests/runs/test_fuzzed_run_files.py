@@ -224,6 +224,8 @@ def limits() -> Iterator[None]:
         signal.SIGPROF: (signal.ITIMER_PROF, give_up, MOST_CPU_S),
     }
     handlers = {number: signal.signal(number, act) for number, (_, act, _) in timers.items()}
+    # Before a run hears signals, and when it does no more, one would end all tests.
+    unheard = signal.signal(signal.SIGTERM, lambda *_: None)
     for timer, _, seconds in timers.values():
         signal.setitimer(timer, seconds)
     try:
@@ -232,6 +234,7 @@ def limits() -> Iterator[None]:
         for number, (timer, *_) in timers.items():
             signal.setitimer(timer, 0.0)
             signal.signal(number, handlers[number])
+        signal.signal(signal.SIGTERM, unheard)
         resource.setrlimit(resource.RLIMIT_AS, (before, hard))
 
 

@@ -251,7 +251,8 @@ def test_a_closed_output_and_the_end_of_the_terminal_lose_nothing(
     assert process.stdout.readline() == f"{version()}: {config}\n"
     process.stdout.close()  # as `| head -1` does
     run = tmp_path / "results/toy"
-    until((run / "checkpoints/step-256").exists)
+    latest = run / "checkpoints/latest.json"
+    until(lambda: latest.exists() and json.loads(latest.read_text())["step"] >= 256)
     process.send_signal(signal.SIGHUP)
     assert "Error" not in process.stderr.read()
     assert process.wait(timeout=120) == 143

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,21 @@ def naming(path: Path) -> Iterator[None]:
     except OSError as error:
         reason = f"cannot write: {error.strerror or error}"
         raise UnwritableError(error.errno, reason, str(path)) from error
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Waits until no other process is in such a context with this folder.
+
+    Where the filesystem knows no such locks it waits for nobody.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def sync(path: Path) -> None:
@@ -65,16 +81,23 @@ def write_atomically(path: Path, data: bytes | str) -> None:
         UnwritableError: what was there before is untouched.
     """
     content = data.encode() if isinstance(data, str) else data
-    # Always the same name: what an interrupted write left behind is overwritten by the next one.
-    temporary = path.with_name(f".{path.name}.tmp")
+    beside = temporary(path)
     with naming(path):
         try:
-            with temporary.open("wb") as file:
+            with beside.open("wb") as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-            temporary.replace(path)
+            beside.replace(path)
         except BaseException:
-            temporary.unlink(missing_ok=True)
+            beside.unlink(missing_ok=True)
             raise
         sync(path.parent)
+
+
+def temporary(path: Path) -> Path:
+    """The file that `write_atomically` writes for another one.
+
+    Always the same: what an interrupted write left behind is overwritten by the next one.
+    """
+    return path.with_name(f".{path.name}.tmp")

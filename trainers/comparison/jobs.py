@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TextIO
 
@@ -32,7 +32,8 @@ class Job:
         results: what the last command writes.
         done: there is nothing to do; None: where the results are.
         folder: where the commands run; None: here.
-        stop: asked every `POLL_S` seconds whether the command that runs is to stop, by SIGTERM.
+        stop: asked every `POLL_S` seconds whether the command that runs is to stop, by SIGTERM; it
+            alone says so: signals of the terminal don't reach the command. None: they do.
     """
 
     name: str
@@ -40,7 +41,7 @@ class Job:
     results: Path
     done: bool | None = None
     folder: Path | None = None
-    stop: Callable[[], bool] = lambda: False
+    stop: Callable[[], bool] | None = None
 
     @property
     def missing(self) -> bool:
@@ -61,14 +62,25 @@ class Ended:
     errors: str
 
 
-def run_missing(jobs: Sequence[Job], at_once: int) -> int:
+def run_missing(jobs: Sequence[Job], at_once: int, stop: Callable[[], bool] | None = None) -> int:
     """Does the jobs that are missing, whatever becomes of others; returns the highest exit code.
 
     Each has one thread: small networks gain little from a second, and jobs go side by side.
+
+    Args:
+        jobs: what to do; their own `stop` is not asked.
+        at_once: so many at a time.
+        stop: asked whether to stop what runs, and to begin no more; see `Job`.
     """
+
+    def run_unless_stopped(job: Job) -> Ended:
+        if stop is not None and stop():
+            return Ended(max(STOPPED), "")
+        return run(replace(job, stop=stop))
+
     missing = [job for job in jobs if job.missing]
     with ThreadPoolExecutor(at_once) as pool:
-        return max((ended.code for ended in pool.map(run, missing)), default=0)
+        return max((ended.code for ended in pool.map(run_unless_stopped, missing)), default=0)
 
 
 def run(job: Job) -> Ended:
@@ -94,6 +106,9 @@ def _execute(command: Sequence[str], job: Job) -> Ended:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
+        # Ctrl-C is for all of the terminal's group: with the SIGTERM that follows it, it would be
+        # a second signal, by which a run stops without saving.
+        process_group=None if job.stop is None else 0,
     )
     stopped = False
     try:
@@ -101,7 +116,7 @@ def _execute(command: Sequence[str], job: Job) -> Ended:
             try:
                 _, errors = process.communicate(timeout=POLL_S)
             except subprocess.TimeoutExpired:
-                if not stopped and job.stop():
+                if not stopped and job.stop is not None and job.stop():
                     process.terminate()
                     stopped = True
             else:

@@ -111,16 +111,22 @@ def read_status(folder: Path) -> dict[str, Any]:
     Raises:
         UserError: it is damaged.
     """
+    status = _written_status(folder)
+    if status.get("state") == "running" and not is_held(folder):
+        status = _written_status(folder)  # it may have ended between the two looks
+        if status.get("state") == "running":
+            status |= {"state": "interrupted", "reason": "its process was killed"}
+    return status
+
+
+def _written_status(folder: Path) -> dict[str, Any]:
     path = folder / STATUS
     if not path.is_file():
         return {}
     try:
-        status = _Status.model_validate_json(path.read_bytes(), strict=True).model_dump()
+        return _Status.model_validate_json(path.read_bytes(), strict=True).model_dump()
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: can't be read: {reason(error)}") from error
-    if status["state"] == "running" and not is_held(folder):
-        status |= {"state": "interrupted", "reason": "its process was killed"}
-    return status
 
 
 class Curves:

@@ -57,21 +57,31 @@ def export(policy: str, folder: Path, results_dir: Path, *, force: bool = False)
     """
     checkpoint = find_checkpoint(policy, results_dir)
     source = run_folder(checkpoint.path)
-    weights = (checkpoint.path / WEIGHTS).read_bytes()
+    weights = _weights(checkpoint)
     contents: dict[str, bytes | str] = {
         WEIGHTS: weights,
-        MANIFEST: weights_manifest(checkpoint, weights),
         CONFIGURATION: (source / CONFIGURATION).read_bytes(),
         METADATA: complete_metadata(source).to_json(),
     }
     if (confidence := read_confidence(checkpoint.path)) is not None:
         contents[CONFIDENCE] = to_bytes(confidence)
+    # Last: one of before does not fit the new weights, and what was cut off is refused by it.
+    contents[MANIFEST] = weights_manifest(checkpoint, weights)
     if (folder / CHECKPOINTS).is_dir():
         raise UserError(f"{folder}: this is a run: choose another folder")
     _write(folder, contents, force)
     if CONFIDENCE not in contents:
         (folder / CONFIDENCE).unlink(missing_ok=True)  # of the policy that was replaced
     return list(contents)
+
+
+def _weights(checkpoint: Loaded) -> bytes:
+    try:
+        return (checkpoint.path / WEIGHTS).read_bytes()
+    except FileNotFoundError as error:
+        raise UserError(
+            f"{checkpoint.path}: its run has removed it meanwhile: export once more"
+        ) from error
 
 
 def export_onnx(options: argparse.Namespace) -> list[str]:

@@ -20,7 +20,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -41,6 +41,9 @@ WEIGHTS = "weights.safetensors"
 STATE_ARRAYS = "state.safetensors"
 STATE = "state.json"
 MANIFEST = "manifest.json"
+
+LOOKS = 5
+"""At checkpoints that change while they are read, at most."""
 
 _FOLDER = re.compile(r"step-(\d+)")
 _LEFTOVER = re.compile(r"\.step-(\d+)\.(tmp|old)-\w+")
@@ -213,7 +216,9 @@ class Checkpoints:
         Raises:
             CheckpointError: there is none that can be used.
         """
-        return self._load_first(sorted(self._entries(), key=_age_order, reverse=True), with_state)
+        return self._load_first(
+            lambda entries: sorted(entries, key=_age_order, reverse=True), with_state
+        )
 
     def load_best(self, *, with_state: bool = True) -> Loaded:
         """Load the checkpoint with the highest score (the later one where two are equal).
@@ -227,7 +232,7 @@ class Checkpoints:
         Raises:
             CheckpointError: there is none that can be used.
         """
-        return self._load_first(_by_merit(self._entries()), with_state)
+        return self._load_first(_by_merit, with_state)
 
     @staticmethod
     def load(path: Path, *, with_state: bool = True) -> Loaded:
@@ -248,15 +253,22 @@ class Checkpoints:
                 f"(step-<N>), such as an earlier one of the same run."
             ) from damage
 
-    def _load_first(self, candidates: list[CheckpointInfo], with_state: bool) -> Loaded:
-        notes = []
-        for entry in candidates:
-            try:
-                loaded = _read(entry.path, with_state)
-            except _DamageError as damage:
-                notes.append(f"passed over the damaged checkpoint {entry.path}: {damage}")
-            else:
-                return replace(loaded, notes=notes)
+    def _load_first(
+        self, ordered: Callable[[list[CheckpointInfo]], list[CheckpointInfo]], with_state: bool
+    ) -> Loaded:
+        """The first that can be used, in an order; anew where a run saves and prunes meanwhile."""
+        for _ in range(LOOKS):
+            entries, notes, loaded = self._entries(), list[str](), None
+            for entry in ordered(entries):
+                try:
+                    loaded = _read(entry.path, with_state)
+                    break
+                except _DamageError as damage:
+                    notes.append(f"passed over the damaged checkpoint {entry.path}: {damage}")
+            if not notes or _paths(entries) == _paths(self._entries()):
+                break
+        if loaded is not None:
+            return replace(loaded, notes=notes)
         if not notes:
             raise CheckpointError(
                 f"there is no checkpoint in {self.directory}: check the path, or start the run "
@@ -380,6 +392,10 @@ def _by_merit(entries: list[CheckpointInfo]) -> list[CheckpointInfo]:
         return entry.score
 
     return sorted(newest_first, key=merit, reverse=True)
+
+
+def _paths(entries: list[CheckpointInfo]) -> set[Path]:
+    return {entry.path for entry in entries}
 
 
 def _write_weights(path: Path, weights: Mapping[str, torch.Tensor]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from trainers.common.errors import UserError
-from trainers.common.files import read_json, write_atomically
+from trainers.common.files import read_json, temporary, write_atomically
 
 EVALUATION = "evaluation"
 REPORT = "evaluation.json"
@@ -59,8 +59,14 @@ class EvaluationFolder:
 
 
 def own_names(folder: Path) -> set[str]:
-    """Names of an evaluation's report and of the files it lists; none if it is no evaluation's."""
+    """Names of an evaluation's report and of the files it lists; none if it is no evaluation's.
+
+    With those under which they are written, as an evaluation that was killed leaves them.
+    """
     try:
-        return {REPORT, *read_json(folder / REPORT)[FILES]}
-    except (FileNotFoundError, ValueError, KeyError, TypeError):
+        names = {REPORT, *read_json(folder / REPORT)[FILES]}
+    except FileNotFoundError:
+        return {temporary(folder / REPORT).name}
+    except (ValueError, KeyError, TypeError):
         return set()
+    return names | {temporary(folder / name).name for name in names}

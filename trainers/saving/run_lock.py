@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import socket
+import time
 from datetime import datetime
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from trainers.common.errors import UserError
 LOCK = "run.lock"
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 RETRIES = 1_000  # as others remove folder or file just then, each time
+LOOKS, LOOK_S = 5, 0.02  # who asks whether a lock is held has it meanwhile, see `is_held`
 
 
 class Holder(BaseModel, frozen=True):
@@ -109,7 +111,7 @@ class RunLock:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         try:
-            fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(descriptor)
             if not _is_at(descriptor, self._path):
                 raise FileNotFoundError(f"{self._path}: was removed by the process that held it")
         except BlockingIOError as error:
@@ -141,6 +143,18 @@ def is_held(directory: Path) -> bool:
     finally:
         os.close(descriptor)
     return False
+
+
+def _lock(descriptor: int) -> None:
+    """Takes the system's lock; BlockingIOError where another process keeps it."""
+    for look in range(LOOKS):
+        try:
+            fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if look == LOOKS - 1:
+                raise
+            time.sleep(LOOK_S)
 
 
 def _is_at(descriptor: int, path: Path) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from trainers.common.files import write_atomically
+from trainers.common.files import alone_in, write_atomically
 from trainers.comparison.tables import markdown
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import dump_yaml
@@ -38,12 +38,13 @@ def write_report(sweep: Sweep, study: optuna.Study, folder: Path, registries: Re
     Raises:
         OSError: the folder can't be written.
     """
-    if scored := finished(study):
-        values = study.best_trial.params
-        write_atomically(folder / BEST, dump_yaml(sweep.run_of(values, registries)))
-        _draw(sweep, scored, folder)
     page = folder / "report.md"
-    write_atomically(page, "\n".join(lines(sweep, study)) + "\n")
+    with alone_in(folder):  # processes of one sweep end at about the same time
+        if scored := finished(study):
+            values = study.best_trial.params
+            write_atomically(folder / BEST, dump_yaml(sweep.run_of(values, registries)))
+            _draw(sweep, scored, folder)
+        write_atomically(page, "\n".join(lines(sweep, study)) + "\n")
     return page
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import zlib
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -32,6 +33,7 @@ from trainers.sweep.plan import Range, Sweep, Value
 STORAGE_ERRORS = (StorageInternalError, SQLAlchemyError)
 """What is raised where a storage that could be reached can no longer be."""
 DEFINITION = "sweep"
+DATABASE_TRIES, DATABASE_PAUSE_S = 4, 0.5
 STARTUP_TRIALS = 5
 """Before the median of others counts."""
 
@@ -89,10 +91,22 @@ def shown_storage(storage: str) -> str:
 
 def _storage(storage: str) -> BaseStorage:
     if "://" in storage:
-        return RDBStorage(storage)
-    path = Path(storage)
+        return _database(storage)
+    # Its lock is a link to it, of which Optuna asks how old it is: one that a killed process left
+    # behind is only ever taken over if the link leads somewhere from its own folder, too.
+    path = Path(storage).absolute()
     path.parent.mkdir(parents=True, exist_ok=True)
-    return JournalStorage(JournalFileBackend(storage))
+    return JournalStorage(JournalFileBackend(str(path)))
+
+
+def _database(url: str) -> RDBStorage:
+    """A database's studies, also where another process makes its tables at the same time."""
+    for _ in range(DATABASE_TRIES - 1):
+        try:
+            return RDBStorage(url)
+        except SQLAlchemyError:
+            time.sleep(DATABASE_PAUSE_S)
+    return RDBStorage(url)
 
 
 def distributions(sweep: Sweep) -> dict[str, BaseDistribution]:

@@ -87,15 +87,20 @@ class Trials:
 
     def _left(self) -> list[Begun]:
         """Trials that were cut off here, and that nobody else has gone on with."""
-        trials = {_name(trial.number): trial for trial in self._study.get_trials(deepcopy=False)}
         found = []
         for place in sorted((self._folder / RUNNING).iterdir()):
             try:
                 lock = RunLock(place)
-                RunLock(self._folder / place.name).close()  # its run may outlive its sweep
             except UserError:
                 continue
-            trial = trials.get(place.name)
+            try:
+                RunLock(self._folder / place.name).close()  # its run may outlive its sweep
+            except UserError:
+                lock.close()
+                continue
+            # Only now: before, another process could still have ended it.
+            trials = self._study.get_trials(deepcopy=False)
+            trial = next((each for each in trials if _name(each.number) == place.name), None)
             if trial is not None and trial.state is TrialState.RUNNING:
                 found.append(Begun(optuna.Trial(self._study, trial._trial_id), lock))
             else:
@@ -104,10 +109,12 @@ class Trials:
 
     def _ask(self, count: int) -> Begun | None:
         """A new trial; None where there are enough."""
-        if len(self._study.get_trials(deepcopy=False)) >= count:
-            return None
-        trial = self._study.ask(self._distributions)
-        return Begun(trial, RunLock(self._folder / RUNNING / _name(trial.number)))
+        while len(self._study.get_trials(deepcopy=False)) < count:
+            trial = self._study.ask(self._distributions)
+            # Another process that has just begun may take it for one that was left.
+            with suppress(UserError):
+                return Begun(trial, RunLock(self._folder / RUNNING / _name(trial.number)))
+        return None
 
     def _run(self, begun: Begun) -> None:
         trial, name = begun.trial, _name(begun.trial.number)
@@ -130,7 +137,7 @@ class Trials:
     def _release(self, name: str, lock: RunLock) -> None:
         """Gives an ended trial's lock up, with its place, which a process before may have made."""
         lock.close()
-        with suppress(FileNotFoundError):
+        with suppress(OSError):  # another process removes it, or looks at what was left there
             (self._folder / RUNNING / name).rmdir()
 
     def _tell(self, trial: optuna.Trial, ended: Ended, watch: Watch) -> None:
@@ -187,8 +194,10 @@ class Watch:
 
     def __call__(self) -> bool:
         """Whether the trial is to stop."""
+        if self._stop_requested():
+            return True
         self.pruned = self.pruned or (self.report() and self._trial.should_prune())
-        return self.pruned or self._stop_requested()
+        return self.pruned
 
     def report(self) -> bool:
         """Tells of evaluations that are new; whether there are any."""

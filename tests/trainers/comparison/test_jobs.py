@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 
@@ -71,6 +72,21 @@ def test_a_job_that_is_to_stop_is_told_and_saves(
     assert run(job).code == 143
     assert saved.exists()
     assert not capsys.readouterr().err
+
+
+def test_signals_of_the_terminal_reach_only_jobs_that_nobody_else_stops(tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    say = ["-c", f"import os; open({str(own)!r}, 'w').write(str(os.getpgid(0)))"]
+    for stop, alone in ((None, False), (lambda: False, True)):
+        assert run(Job("group", [say], own, stop=stop)).code == 0
+        assert (int(own.read_text()) != os.getpgid(0)) is alone
+
+
+def test_no_job_begins_after_the_stop(tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    jobs = [append(first, "a"), append(second, "b")]
+    assert run_missing(jobs, at_once=1, stop=first.exists) == 143
+    assert not second.exists()
 
 
 def test_a_job_whose_watching_fails_is_stopped(

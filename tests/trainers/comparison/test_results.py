@@ -90,6 +90,18 @@ def test_a_run_goes_on_as_long_as_a_process_writes_into_it(
     assert status["step"] == 3
 
 
+def test_a_run_that_ends_between_two_looks_has_ended(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ends(directory: Path) -> bool:
+        (directory / "status.json").write_text('{"state": "finished", "step": 4}')
+        return False
+
+    monkeypatch.setattr(results, "is_held", ends)
+    (folder / "status.json").write_text('{"state": "running", "step": 3}')
+    assert read_status(folder)["state"] == "finished"
+
+
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"this is no run: it has no configuration\.yaml"):
         read_run(tmp_path)

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import safetensors.torch
 import torch
 
 from trainers.saving import checkpoint
-from trainers.saving.checkpoint import CheckpointError, Checkpoints
+from trainers.saving.checkpoint import CheckpointError, Checkpoints, Loaded
 
 FILES = ["weights.safetensors", "state.safetensors", "state.json", "manifest.json"]
 
@@ -122,6 +123,24 @@ def test_a_cut_short_file_falls_back_to_the_one_before(
     assert name in note
     with pytest.raises(CheckpointError, match=name):
         checkpoints.load(path)
+
+
+@pytest.mark.parametrize("load", [Checkpoints.load_best, Checkpoints.load_latest])
+def test_one_that_is_pruned_while_it_is_read_is_no_damaged_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, load: Callable[[Checkpoints], Loaded]
+) -> None:
+    checkpoints = Checkpoints(tmp_path, keep=1)
+    save(checkpoints, 100, score=1.0)
+    read = checkpoint._read
+
+    def late(path: Path, with_state: bool) -> Loaded:
+        monkeypatch.setattr(checkpoint, "_read", read)
+        save(checkpoints, 200, score=2.0)
+        return read(path, with_state)
+
+    monkeypatch.setattr(checkpoint, "_read", late)
+    loaded = load(checkpoints)
+    assert (loaded.step, loaded.notes) == (200, [])
 
 
 @pytest.mark.parametrize("name", FILES[:3])

@@ -104,6 +104,7 @@ def a_run(folder: Path) -> None:
     for file in files:
         (folder / file).touch()
     EvaluationFolder(folder / "evaluation", ["a.png"]).write({}, [("a.png", b"")])
+    (folder / "evaluation/.a.png.tmp").touch()  # of an evaluation that was killed
 
 
 def test_what_a_run_left_is_replaced_whole(tmp_path: Path) -> None:
@@ -112,6 +113,14 @@ def test_what_a_run_left_is_replaced_whole(tmp_path: Path) -> None:
     begin(tmp_path / "run", {"a.txt": "new"}, resume=False)
     assert names(tmp_path / "run") == ["a.txt", LOCK]
     lock.close()
+
+
+def test_an_evaluation_that_was_killed_at_once_is_replaced(tmp_path: Path) -> None:
+    a_run(tmp_path)
+    for path in (tmp_path / "evaluation").iterdir():
+        path.unlink()
+    (tmp_path / "evaluation/.evaluation.json.tmp").touch()
+    claim_and_give_up(tmp_path, force=True)
 
 
 @pytest.mark.parametrize(

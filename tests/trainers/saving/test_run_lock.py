@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import signal
@@ -133,6 +134,22 @@ def test_a_folder_that_can_never_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "run").touch()
     with pytest.raises(FileExistsError, match="run"):
         RunLock(tmp_path / "run")
+
+
+def test_who_asks_just_then_whether_it_is_held_is_no_holder(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    lockf, tries = fcntl.lockf, []
+
+    def asked(descriptor: int, operation: int) -> None:
+        tries.append(operation)
+        if len(tries) <= 2:
+            raise BlockingIOError
+        lockf(descriptor, operation)
+
+    monkeypatch.setattr("trainers.saving.run_lock.fcntl.lockf", asked)
+    RunLock(tmp_path / "run").close()
+    assert len(tries) == 3
 
 
 def test_a_lock_that_became_anothers_is_left_to_it(tmp_path: Path) -> None:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from optuna.storages import RDBStorage
+from sqlalchemy.exc import OperationalError
 
 from trainers.common.errors import UserError
 from trainers.runfile.registry import Registries
+from trainers.sweep import study as study_module
 from trainers.sweep.plan import load_sweep
 from trainers.sweep.study import distributions, open_study, shown_storage
 
@@ -50,6 +54,45 @@ def test_processes_that_ask_together_share_a_grid(
     studies = [open_study(sweep, str(tmp_path / "journal")) for _ in range(2)]
     asked = [study.ask(distributions(sweep)) for _ in range(2) for study in studies]
     assert [trial.params for trial in asked] == sweep.cells
+
+
+def test_the_journals_lock_leads_to_it_from_its_own_folder(
+    sweep_file: Callable[..., Path],
+    known: Registries,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    symlink, made = os.symlink, []
+
+    def seen(target: str, link: str) -> None:
+        symlink(target, link)
+        made.append(Path(link).exists())
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "symlink", seen)
+    open_study(load_sweep(sweep_file(), known), "results/journal")
+    assert made
+    assert all(made)
+
+
+def test_a_database_whose_tables_another_process_makes_just_then_is_asked_again(
+    sweep_file: Callable[..., Path],
+    known: Registries,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tries = []
+
+    def storage(url: str) -> RDBStorage:
+        tries.append(url)
+        if len(tries) == 1:
+            raise OperationalError("CREATE TABLE studies", {}, Exception("it exists"))
+        return RDBStorage(url)
+
+    monkeypatch.setattr(study_module, "RDBStorage", storage)
+    monkeypatch.setattr(study_module, "DATABASE_PAUSE_S", 0.0)
+    open_study(load_sweep(sweep_file(), known), f"sqlite:///{tmp_path}/study.db")
+    assert len(tries) == 2
 
 
 def test_a_sweep_of_the_same_name_is_refused_if_it_is_another(

@@ -7,7 +7,8 @@ import os
 import re
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from trainers.experience.env_runner import NonFiniteError
 from trainers.run import run_file
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import load_run
+from trainers.saving.run_lock import RunLock
 from trainers.sweep.__main__ import main
 from trainers.sweep.plan import load_sweep
 from trainers.sweep.study import distributions, open_study
@@ -167,6 +169,38 @@ def test_an_interrupted_sweep_goes_on_as_if_it_had_not_been(
         assert (one.params, one.value) == (other.params, other.value)
         assert one.intermediate_values == other.intermediate_values
     assert not list(Path("results/pole/running").iterdir())
+
+
+@contextmanager
+def held_by_another(place: Path) -> Iterator[None]:
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            RunLock(place)
+            os.write(writer, b"held")
+            time.sleep(120.0)
+        finally:  # never back into pytest
+            os._exit(1)
+    try:
+        assert os.read(reader, 4) == b"held"
+        yield
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        os.close(reader)
+        os.close(writer)
+
+
+def test_a_trial_that_another_process_goes_on_with_is_left_to_it(
+    sweep_file: Callable[..., Path], runs: InProcess
+) -> None:
+    path = sweep_file(fixed=SHORT, space=ONE, trials=2)
+    with held_by_another(Path("results/pole/running/trial-0000")):
+        assert sweep(path) == DONE
+    assert [trial.state for trial in trials_of()] == [TrialState.RUNNING, TrialState.COMPLETE]
+    assert sweep(path) == DONE
+    assert [trial.state for trial in trials_of()] == [TrialState.COMPLETE] * 2
 
 
 def test_a_broken_trial_is_told_of_and_the_sweep_goes_on(
