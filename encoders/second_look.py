@@ -81,7 +81,8 @@ class SecondLook(PointEncoder):
         )
         logit_std: float | None = Field(
             None,
-            gt=0.0,
+            ge=0.01,
+            le=100.0,
             description="Logits of a map of the second look are scaled down where their standard "
             "deviation over an image's patches is over this. Without it a map may harden on one "
             "patch, where it has no gradient any more. null: as they are.",

@@ -52,9 +52,10 @@ def shortage(needed_bytes: float, purpose: str) -> str | None:
     """In words, that the machine has not got so much memory; None where it has.
 
     Args:
-        needed_bytes: how much.
+        needed_bytes: how much, in each of the processes that torchrun has started here.
         purpose: what it is for; see `adding_up`.
     """
+    needed_bytes *= int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     needs = _needs.get()
     if needs is not None:
         needs[purpose] = needs.get(purpose, 0.0) + needed_bytes

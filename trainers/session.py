@@ -21,7 +21,7 @@ from rewards.reward import RewardTerm
 from trainers.algorithms.base import Algorithm
 from trainers.common.devices import resolve_device
 from trainers.common.errors import UserError, suggestion
-from trainers.distributed.states import Axes
+from trainers.distributed.states import Axes, on_cpu
 from trainers.distributed.world import ALONE, World
 from trainers.experience.env_runner import EnvRunner
 from trainers.experience.episodes import EpisodeBatch
@@ -165,6 +165,12 @@ class Session:
     def weights(self) -> dict[str, Tensor]:
         """The policy's weights."""
         return dict(self.algorithm.policy.state_dict())
+
+    def share_weights(self) -> None:
+        """Begins with the first process's: files, and last bits, may differ between machines."""
+        if self.world.size > 1:
+            own = on_cpu(self.weights())
+            self.algorithm.policy.load_state_dict(self.world.first(own))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything but the weights; see `resumable`. Of the environments this process's share."""

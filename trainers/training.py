@@ -108,6 +108,8 @@ class Training:
                 with timed("collect"):
                     self._session.algorithm.collect()
                 copy = before.copied()
+                if self._session.world.any(copy is None):
+                    copy = None  # then none is stopped half way
             self._update(copy, before.step / max_steps)
             present = self._session.resumable()
             step = present.step

@@ -186,7 +186,11 @@ def _line(ranks: Sequence[int], seconds: Sequence[float]) -> tuple[float, float]
     if len(ranks) == 1:
         return seconds[0], 0.0
     line = statistics.linear_regression(ranks, seconds)
-    return max(line.intercept, 0.0), max(line.slope, 0.0)
+    if line.slope < 0.0:
+        return statistics.mean(seconds), 0.0
+    if line.intercept < 0.0:
+        return 0.0, statistics.linear_regression(ranks, seconds, proportional=True).slope
+    return line.intercept, line.slope
 
 
 def expected_maximum(count: int) -> float:

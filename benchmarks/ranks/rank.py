@@ -74,10 +74,11 @@ def of_ranks(run_file: Path, registries: Registries, ranks: int) -> RunSettings:
     """A file's run of so many ranks, each with a thread."""
     overrides = {
         "environment.num_envs": ENVS * ranks,
-        "environment.workers": 1,
         "trainer.hyperparameters.buffer_size": BUFFER * ranks,
         "trainer.hyperparameters.batch_size": BATCH * ranks,
     }
+    if hasattr(load_run(run_file, [], registries).environment.settings, "workers"):
+        overrides["environment.workers"] = 1
     return load_run(run_file, [f"{key}={value}" for key, value in overrides.items()], registries)
 
 

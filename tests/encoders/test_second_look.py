@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
+from pydantic import ValidationError
 
 from encoders.cameras import Pinhole
 from encoders.second_look import IMAGES_AT_ONCE, SecondLook
@@ -121,6 +122,12 @@ def test_logits_that_spread_too_far_are_scaled_down_over_what_was_seen():
     assert narrow.tolist() == pytest.approx([0.5, -0.5, 0.5, -0.5])
     nothing_seen = encoder._bounded(logits[None], torch.ones(1, 5, 1, dtype=torch.bool))
     assert nothing_seen.isfinite().all()
+
+
+@pytest.mark.parametrize("limit", [1e-3, 1e3])
+def test_limits_that_can_not_be_calculated_with_are_refused(limit):
+    with pytest.raises(ValidationError, match="logit_std"):
+        SecondLook.Settings(logit_std=limit)
 
 
 def test_bounded_logits_leave_no_map_on_one_patch_alone():

@@ -40,6 +40,12 @@ def test_the_process_own_limit_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     assert machine_bytes() == 10**9
 
 
+def test_processes_of_one_machine_need_it_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
+    assert shortage(2**33, "all") is None
+    assert shortage(2**33 + 1, "all") == "needs 34.4 GB, and the machine has 34.4 GB"
+
+
 def test_a_shortage_has_both_numbers() -> None:
     assert shortage(2**35, "all") is None
     assert shortage(2**35 + 1, "all") == "needs 34.4 GB, and the machine has 34.4 GB"

@@ -325,8 +325,11 @@ class OffPolicyAlgorithm(ABC):
     def _optimizer_step(self, name: str, loss: Tensor) -> None:
         """One step of the optimizer of that name, with clipped gradients, if all is finite."""
         optimizer, parameters = self._optimizers[name], self._parameters[name]
-        mean = partial(self._env_runner.world.mean, weight=self._weight)
-        step = optimizer_step(optimizer, loss, parameters, self._max_gradient_norm, mean)
+        world = self._env_runner.world
+        mean = partial(world.mean, weight=self._weight)
+        step = optimizer_step(
+            optimizer, loss, parameters, self._max_gradient_norm, mean, alone=world.size == 1
+        )
         self._steps_taken.append(step)
 
     # -- the state -------------------------------------------------------------------------------

@@ -110,7 +110,8 @@ class OnPolicyAlgorithm:
             )
         steps = -(-hyperparameters.buffer_size // env_runner.num_envs)
         self.collection_steps = steps * env_runner.num_envs
-        check_room(env_runner.env, steps, "trainer.hyperparameters.buffer_size")
+        pooled = 1 + env_runner.world.shares_memory
+        check_room(env_runner.env, pooled * steps, "trainer.hyperparameters.buffer_size")
         reward_normalizer = (
             RewardNormalizer(env_runner.env.num_envs, self._gamma)
             if hyperparameters.normalize_rewards
@@ -134,7 +135,7 @@ class OnPolicyAlgorithm:
         """See `Algorithm.collect`."""
         rollout = self._collector.collect(self._gamma, self._lambd)
         if self._compares_tries:
-            rollout = rollout.against_other_tries()
+            rollout = rollout.against_other_tries(self._env_runner.world)
         self._rollout = rollout.pooled(self._env_runner.world)
 
     def state_dict(self) -> dict[str, Any]:
@@ -191,4 +192,11 @@ class OnPolicyAlgorithm:
         """
         parameters = [p for group in self._optimizer.param_groups for p in group["params"]]
         mean = partial(self._env_runner.mean, weight=weight)
-        return optimizer_step(self._optimizer, loss, parameters, self._max_gradient_norm, mean)
+        return optimizer_step(
+            self._optimizer,
+            loss,
+            parameters,
+            self._max_gradient_norm,
+            mean,
+            alone=self._env_runner.world.size == 1,
+        )

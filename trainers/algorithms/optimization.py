@@ -58,6 +58,8 @@ def optimizer_step(
     parameters: Sequence[nn.Parameter],
     max_gradient_norm: float,
     mean: Mean = unchanged,
+    *,
+    alone: bool = True,
 ) -> Tensor:
     """Takes one step down the gradient of a loss with respect to some parameters, and no others.
 
@@ -70,12 +72,15 @@ def optimizer_step(
         parameters: what may change; frozen ones among them stay as they are.
         max_gradient_norm: the gradient is clipped to this norm.
         mean: over all processes of a run, of the loss and the gradients.
+        alone: whether there are no others. Parameters that the loss does not depend on are left
+            alone then, and else have a gradient of 0.
 
     Returns:
         The loss and its gradient's norm before it was clipped, (2,), without a gradient.
     """
     learned = [parameter for parameter in parameters if parameter.requires_grad]
-    own = torch.autograd.grad(loss, learned, allow_unused=True)
+    # An unused parameter of one process may be used in another, and all send as much.
+    own = torch.autograd.grad(loss, learned, allow_unused=True, materialize_grads=not alone)
     loss, *gradients = mean([loss, *(part for part in own if part is not None)])
     left = iter(gradients)
     for parameter, part in zip(learned, own, strict=True):

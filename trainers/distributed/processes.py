@@ -63,6 +63,15 @@ class Processes(Ranks):
             dist.all_gather_object(values, value)
             return values
 
+    def gather_to_first(self, value: Value) -> list[Value]:
+        """See `World.gather_to_first`."""
+        with timed("gather"), self._naming_the_lost():
+            if self._memory is not None:
+                return self._memory.gather(value, to_first=True)
+            values: list[Any] | None = [None] * self.size if self.writes else None
+            dist.gather_object(value, values)
+            return values or []
+
     def sum(self, parts: Sequence[Tensor], weight: float) -> Tensor:
         """See `Ranks.sum`."""
         with timed("all_reduce"), self._naming_the_lost():

@@ -24,6 +24,8 @@ from torch import Tensor
 from trainers.common.timers import timed
 
 PAGE_BYTES = 4096
+KEPT_BYTES = 2**28
+"""Of places for later exchanges: those of a checkpoint with replay buffers are given back."""
 NUMBER = struct.Struct("q")
 HANDED_ON = b"memory"
 
@@ -108,8 +110,12 @@ class SharedMemory:
         self._wait()
         return total.clone()
 
-    def gather(self, value: Any) -> list[Any]:
+    def gather(self, value: Any, *, to_first: bool = False) -> list[Any]:
         """Everyone's values, by rank.
+
+        Args:
+            value: one's own.
+            to_first: the first process alone has them; others have nothing.
 
         Raises:
             OSError: one of the others is gone, or has not come in time.
@@ -120,8 +126,11 @@ class SharedMemory:
         places[self._rank][: len(content)] = np.frombuffer(content, np.uint8)
         self._wait()
         # What is behind a value in its place is not read.
-        values = [pickle.loads(place) for place in places[: self._size]]
+        unread = to_first and self._rank > 0
+        values = [] if unread else [pickle.loads(place) for place in places[: self._size]]
         self._wait()
+        if self._places.nbytes > KEPT_BYTES:
+            self._places = torch.empty(self._size + 1, 0, dtype=torch.uint8)
         return values
 
     def pool(self, tensors: Sequence[Tensor]) -> list[Tensor]:

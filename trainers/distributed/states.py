@@ -38,6 +38,18 @@ def differing(state: Mapping[str, Any], axes: Axes) -> dict[str, Any]:
     return {name: _differing(value, axes.get(name)) for name, value in state.items()}
 
 
+def on_cpu(value: Any) -> Any:
+    """The same with tensors on the CPU, in mappings, lists and tuples."""
+    match value:
+        case Tensor():
+            return value.cpu()
+        case Mapping():
+            return {name: on_cpu(part) for name, part in value.items()}
+        case list() | tuple():
+            return type(value)(map(on_cpu, value))
+    return value
+
+
 def divided(state: Mapping[str, Any], axes: Axes, share: Share) -> dict[str, Any]:
     """One process's share of a state of all environments.
 

@@ -21,7 +21,7 @@ from trainers.common.errors import Failure, NonFiniteError, UserError
 from trainers.common.origin import is_told
 from trainers.common.share import Share
 from trainers.common.stopping import StopRequested
-from trainers.distributed.states import Axes, differing, divided, joined
+from trainers.distributed.states import Axes, differing, divided, joined, on_cpu
 
 Value = TypeVar("Value")
 
@@ -62,6 +62,10 @@ class World:
 
     def gather(self, value: Value) -> list[Value]:
         """Everyone's value, by rank; tensors in it are on the CPU."""
+        return [value]
+
+    def gather_to_first(self, value: Value) -> list[Value]:
+        """As `gather`, of the first process; others have nothing."""
         return [value]
 
     def first(self, value: Value) -> Value:
@@ -134,7 +138,10 @@ class World:
         return averager.pop_means()
 
     def state(self, state: Mapping[str, Any], axes: Axes) -> Mapping[str, Any]:
-        """The state that one process alone would have; see `states.joined`."""
+        """The state that one process alone would have; see `states.joined`.
+
+        The first process's, which writes it; others have nothing of it.
+        """
         return state
 
     def own(self, state: Mapping[str, Any], axes: Axes, share: Share) -> Mapping[str, Any]:
@@ -163,6 +170,10 @@ class Ranks(World):
             parts: vectors of the same kind.
             weight: of one's own.
         """
+        raise NotImplementedError
+
+    def gather_to_first(self, value: Value) -> list[Value]:
+        """See `World.gather_to_first`."""
         raise NotImplementedError
 
     def name(self, rank: int) -> str:
@@ -236,7 +247,9 @@ class Ranks(World):
     def state(self, state: Mapping[str, Any], axes: Axes) -> Mapping[str, Any]:
         """See `World.state`."""
         # What is alike everywhere, as an optimizer's, is told by the first alone.
-        return joined(self.gather(differing(state, axes) if self.rank else state), axes)
+        own = on_cpu(differing(state, axes) if self.rank else state)
+        states = self.gather_to_first(own)
+        return joined(states, axes) if self.writes else {}
 
     def own(self, state: Mapping[str, Any], axes: Axes, share: Share) -> Mapping[str, Any]:
         """See `World.own`."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from trainers.common.errors import UserError
 from trainers.common.share import Share
-from trainers.distributed.world import World
+from trainers.distributed.world import ALONE, World
 from trainers.experience.returns import leave_one_out
 from trainers.networks.observations import Observations, gather
 from trainers.networks.recurrent import Sequences
@@ -103,13 +103,16 @@ class Rollout:
             frames, index = distinct, position
         return {name: gather(tensor, frames) for name, tensor in self.frames.items()}, index
 
-    def against_other_tries(self) -> Rollout:
+    def against_other_tries(self, world: World = ALONE) -> Rollout:
         """The same, with advantages over the mean return of the other actions at each frame.
 
+        Args:
+            world: the processes of the run, which may have more tries than there are here.
+
         Raises:
-            UserError: there are none.
+            UserError: there are none; all of the processes say so.
         """
-        if len(self.frame_index.unique()) == len(self):
+        if not world.any(len(self.frame_index.unique()) < len(self)):
             raise UserError(
                 "trainer.hyperparameters.baseline: frame compares actions at the same frame, and "
                 "every frame was acted on once: use images that stay for several actions "

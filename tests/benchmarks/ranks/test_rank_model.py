@@ -10,7 +10,18 @@ from pathlib import Path
 import pytest
 
 import benchmarks.ranks.__main__ as command
-from benchmarks.ranks.model import Measured, Model, Network, expected_maximum, own_deviation
+from benchmarks.ranks.model import (
+    Measured,
+    Model,
+    Network,
+    _line,
+    expected_maximum,
+    own_deviation,
+)
+from benchmarks.ranks.rank import of_ranks
+from trainers.runfile.registry import load_registries
+
+ROOT = Path(__file__).parents[3]
 
 MODEL = Model(
     cores=2,
@@ -84,6 +95,26 @@ def test_a_fit_finds_the_model_that_was_measured(counts: tuple[int, ...]) -> Non
         assert found.update_s(ranks, 2) == pytest.approx(MODEL.update_s(ranks, 2), rel=1e-4)
     assert found.deviation == pytest.approx(MODEL.deviation)
     assert found.bytes_per_s == pytest.approx(MODEL.bytes_per_s, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "line"),
+    [
+        ([4.0, 6.0, 10.0], (2.0, 1.0)),
+        ([3.0, 2.0, 1.0], (2.0, 0.0)),
+        ([1.0, 3.0, 7.0], (0.0, 5 / 6)),
+    ],
+)
+def test_a_line_that_neither_falls_nor_begins_below_zero_fits_best(
+    seconds: list[float], line: tuple[float, float]
+) -> None:
+    assert _line([2, 4, 8], seconds) == pytest.approx(line, abs=0.02)
+
+
+@pytest.mark.parametrize("name", ["gymnasium/pendulum_ppo", "paper/frame_grab"])
+def test_run_files_of_any_environment_can_be_measured(name: str) -> None:
+    run = of_ranks(ROOT / f"config/{name}.yaml", load_registries(), 2)
+    assert getattr(run.environment.settings, "workers", 1) == 1
 
 
 def test_what_was_measured_is_the_median_of_all_rounds(tmp_path: Path) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from trainers.algorithms.optimization import (
     adam,
@@ -70,6 +72,19 @@ def test_what_the_loss_does_not_know_stays_as_it_is() -> None:
         optimizer_step(optimizer, 2.0 * known, [known, unknown], INFINITE)
     assert known.item() == pytest.approx(0.8)
     assert (unknown.item(), unknown.grad) == (1.0, None)
+
+
+def test_of_many_processes_each_sends_a_gradient_of_all_parameters() -> None:
+    known, unknown = nn.Parameter(torch.ones(2)), nn.Parameter(torch.ones(3))
+    optimizer = adam([[known, unknown]], torch.device("cpu"))
+    sent: list[list[int]] = []
+
+    def mean(own: Sequence[Tensor]) -> Sequence[Tensor]:
+        sent.append([part.numel() for part in own])
+        return own
+
+    optimizer_step(optimizer, known.sum(), [known, unknown], INFINITE, mean, alone=False)
+    assert sent == [[1, 2, 3]]
 
 
 def stepped_adam(*shape: int) -> torch.optim.Adam:

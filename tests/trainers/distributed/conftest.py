@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import pytest
+import torch
 from torch import Tensor
 
 from trainers.distributed.shared_memory import SharedMemory
@@ -39,11 +40,21 @@ class ThreadRanks(Ranks):
     def gather(self, value: Any) -> list[Any]:
         return self.memory.gather(value)
 
+    def gather_to_first(self, value: Any) -> list[Any]:
+        return self.memory.gather(value, to_first=True)
+
     def sum(self, parts: Sequence[Tensor], weight: float) -> Tensor:
         return self.memory.sum(parts, weight)
 
     def pool(self, tensors: Sequence[Tensor]) -> Sequence[Tensor]:
         return self.memory.pool(tensors)
+
+
+@pytest.fixture(autouse=True)
+def _cudnn_is_as_before() -> Iterator[None]:
+    """TRPO switches it off for a moment: threads, other than processes, put back each other's."""
+    yield
+    torch.backends.cudnn.enabled = True
 
 
 @pytest.fixture

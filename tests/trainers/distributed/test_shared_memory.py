@@ -104,6 +104,22 @@ def test_everyones_values_come_by_rank_whatever_their_sizes() -> None:
     assert in_processes(3, work) == dict.fromkeys(range(3), expected)
 
 
+def test_what_is_for_the_first_is_read_by_no_other_and_large_places_are_given_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("trainers.distributed.shared_memory.KEPT_BYTES", 10**6)
+
+    def work(rank: int, memory: SharedMemory) -> Any:
+        few = memory.gather(rank, to_first=True)
+        kept = memory._places.nbytes
+        many = memory.gather(bytes(10**6), to_first=True)
+        return few, kept > 0, list(map(len, many)), memory._places.nbytes, memory.gather(rank)
+
+    found = in_processes(2, work)
+    assert found[0] == ([0, 1], True, [10**6, 10**6], 0, [0, 1])
+    assert found[1] == ([], True, [], 0, [0, 1])
+
+
 EXCHANGES: dict[str, Callable[[SharedMemory], Any]] = {
     "sum": lambda memory: memory.sum([torch.ones(100_000)], 1.0),
     "gather": lambda memory: memory.gather(torch.ones(100_000)),

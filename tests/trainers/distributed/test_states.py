@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from trainers.common.share import Share
-from trainers.distributed.states import EACH, differing, divided, joined
+from trainers.distributed.states import EACH, differing, divided, joined, on_cpu
 
 AXES = {"reward": 0, "env": {"actions": 1, "views": 0}, "hidden": 0, "buffer": EACH}
 
@@ -38,6 +38,13 @@ def test_states_are_put_together_by_environment_and_the_latest_steps_are_kept_la
     assert torch.equal(whole["hidden"], torch.arange(3))
     assert whole["optimizer"] == {"lr": 0.1}
     assert whole["buffer"] == ["of 0", "of 2"]
+
+
+def test_tensors_of_a_state_are_told_from_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.Tensor, "cpu", lambda own: own + 1)
+    moved = on_cpu({"noise": torch.zeros(2), "lists": [torch.zeros(1), "name"], "steps": 3})
+    assert moved["noise"].tolist() == [1, 1]
+    assert (moved["lists"][0].item(), moved["lists"][1], moved["steps"]) == (1, "name", 3)
 
 
 @pytest.mark.parametrize("ranks", [1, 2, 3])

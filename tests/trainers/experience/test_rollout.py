@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from encoders.spaces import DepthImage, RgbImage
 from trainers.common.errors import UserError
 from trainers.common.share import Share
+from trainers.distributed.world import World
 from trainers.experience.frames import FrameStore
 from trainers.experience.rollout import Rollout
 
@@ -216,6 +217,23 @@ def test_tries_are_compared_at_their_frame() -> None:
     rollout = rollout_of(torch.tensor([0, 1, 0, 1])).against_other_tries()
     assert rollout.advantages.tolist() == [-2.0, -2.0, 2.0, 2.0]  # of the returns 0, 1, 2, 3
     assert rollout.returns.tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(("second", "refused"), [([0, 0], []), ([0, 1], [0, 1])])
+def test_tries_of_all_processes_decide_whether_they_can_be_compared(
+    second: list[int], refused: list[int]
+) -> None:
+    class Pair(World):
+        def any(self, condition: bool) -> bool:
+            return condition or len(set(second)) < len(second)
+
+    failed = []
+    for rank, frames in enumerate(([0, 1], second)):
+        try:
+            rollout_of(torch.tensor(frames)).against_other_tries(Pair())
+        except UserError:
+            failed.append(rank)
+    assert failed == refused
 
 
 def test_single_tries_can_not_be_compared() -> None:
