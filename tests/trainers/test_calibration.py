@@ -172,7 +172,7 @@ def test_it_goes_where_the_weights_go(
     again = tmp_path / "again"
     assert export(["toy", str(again), "--results-dir", str(results)]) == DONE
     assert f"{again}: weights.safetensors, " in (said := capfd.readouterr().out)
-    assert said.rstrip().endswith(FILE)
+    assert said.rstrip().endswith(f"{FILE}, manifest.json")
     assert (again / FILE).read_bytes() == own
     find_checkpoint("toy", results).path.joinpath(FILE).unlink()
     assert export(["toy", str(again), "--results-dir", str(results), "--force"]) == DONE

@@ -11,8 +11,11 @@ import pytest
 
 from trainers import evaluation
 from trainers.common.command import DONE, MISTAKE
+from trainers.common.errors import UserError
+from trainers.deployment import exporting
 from trainers.evaluation import evaluate
 from trainers.export import main
+from trainers.inference.policy import Policy
 
 
 @pytest.fixture
@@ -36,6 +39,24 @@ def test_an_exported_policy_has_the_figures_of_its_run(results: Path, tmp_path: 
     }
     own = evaluate(str(folder), episodes=8, seed=0)
     assert own == evaluate("toy", episodes=8, seed=0, results_dir=results)
+
+
+def test_an_export_that_was_cut_off_is_no_policy(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = exporting.write_atomically
+
+    def cut_off(path: Path, content: bytes | str) -> None:
+        if path.name == "policy.json":
+            raise KeyboardInterrupt
+        write(path, content)
+
+    monkeypatch.setattr(exporting, "write_atomically", cut_off)
+    with pytest.raises(KeyboardInterrupt):
+        exporting.export("toy", tmp_path / "mine", results)
+    assert (tmp_path / "mine/weights.safetensors").exists()
+    with pytest.raises(UserError, match="mine"):
+        Policy.load(tmp_path / "mine")
 
 
 @pytest.fixture
