@@ -104,7 +104,9 @@ def _database(url: str) -> RDBStorage:
     for _ in range(DATABASE_TRIES - 1):
         try:
             return RDBStorage(url)
-        except SQLAlchemyError:
+        except SQLAlchemyError as error:
+            if "already exists" not in str(error):
+                raise
             time.sleep(DATABASE_PAUSE_S)
     return RDBStorage(url)
 

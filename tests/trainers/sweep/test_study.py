@@ -86,7 +86,7 @@ def test_a_database_whose_tables_another_process_makes_just_then_is_asked_again(
     def storage(url: str) -> RDBStorage:
         tries.append(url)
         if len(tries) == 1:
-            raise OperationalError("CREATE TABLE studies", {}, Exception("it exists"))
+            raise OperationalError("CREATE TABLE studies", {}, Exception("it already exists"))
         return RDBStorage(url)
 
     monkeypatch.setattr(study_module, "RDBStorage", storage)
