@@ -106,7 +106,8 @@ def run_file(
             # Nothing is replaced before it is certain that the run can begin.
             with world.together():
                 notes = _start(session, options, resumed)
-            session.share_weights()
+            if resumed is None:
+                session.share_weights()
             start = session.env_runner.step_count
             held_out = stack.enter_context(_held_out(session, run, start, stop_requested))
         except StopRequested:

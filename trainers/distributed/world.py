@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -175,6 +175,10 @@ class Ranks(World):
     def gather_to_first(self, value: Value) -> list[Value]:
         """See `World.gather_to_first`."""
         raise NotImplementedError
+
+    def first(self, value: Value) -> Value:
+        """See `World.first`: only that one is sent."""
+        return self.gather(value if self.writes else cast(Value, None))[0]
 
     def name(self, rank: int) -> str:
         """A process, for people."""

@@ -265,7 +265,7 @@ class Checkpoints:
                     break
                 except _DamageError as damage:
                     notes.append(f"passed over the damaged checkpoint {entry.path}: {damage}")
-            if not notes or _paths(entries) == _paths(self._entries()):
+            if not notes or set(entries) == set(self._entries()):
                 break
         if loaded is not None:
             return replace(loaded, notes=notes)
@@ -392,10 +392,6 @@ def _by_merit(entries: list[CheckpointInfo]) -> list[CheckpointInfo]:
         return entry.score
 
     return sorted(newest_first, key=merit, reverse=True)
-
-
-def _paths(entries: list[CheckpointInfo]) -> set[Path]:
-    return {entry.path for entry in entries}
 
 
 def _write_weights(path: Path, weights: Mapping[str, torch.Tensor]) -> None:
