@@ -14,6 +14,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from trainers.common.cores import local_ranks
+
 CONTAINER_LIMITS = (
     Path("/sys/fs/cgroup/memory.max"),
     Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
@@ -55,7 +57,7 @@ def shortage(needed_bytes: float, purpose: str) -> str | None:
         needed_bytes: how much, in each of the processes that torchrun has started here.
         purpose: what it is for; see `adding_up`.
     """
-    needed_bytes *= int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    needed_bytes *= local_ranks()
     needs = _needs.get()
     if needs is not None:
         needs[purpose] = needs.get(purpose, 0.0) + needed_bytes

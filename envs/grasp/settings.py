@@ -406,8 +406,8 @@ class GraspSettings(BaseModel, frozen=True, extra="forbid"):
         None,
         ge=0,
         le=1024,
-        description="PyBullet's worker processes, or threads of `simulator: fast`; 0: none beside "
-        "this one; null: one per core.",
+        description="Threads of compiled loops, and PyBullet's worker processes; 0: none beside "
+        "this one; null: one per core, which torchrun's processes share.",
     )
     episode_steps: int = Field(10, ge=1, description="Actions before an episode is truncated.")
     end_on_success: bool = Field(
@@ -475,3 +475,8 @@ class GraspSettings(BaseModel, frozen=True, extra="forbid"):
         if "privileged" in self.cameras:
             raise ValueError("cameras: the name 'privileged' is taken by the observation of it")
         return self
+
+    @property
+    def threads(self) -> int | None:
+        """Of this process's compiled loops; None: one for each core that may be used."""
+        return None if self.workers is None else max(self.workers, 1)

@@ -16,14 +16,19 @@ V1_QUOTA, V1_PERIOD = "cpu.cfs_quota_us", "cpu.cfs_period_us"
 def usable_cores() -> int:
     """Threads that can run at once: one a core of the affinity, within a container's quota.
 
-    A part of a core counts as one: a thread that is held up now and then is better than a share of
-    the quota that nobody uses.
+    The processes that torchrun has started on this machine share them. A part of a core counts as
+    one: a thread that is held up now and then is better than a share of the quota that nobody uses.
     """
     if hasattr(os, "sched_getaffinity"):  # not on macOS
         allowed = len(os.sched_getaffinity(0))
     else:
         allowed = os.cpu_count() or 1
-    return math.ceil(min(allowed, quota()))
+    return math.ceil(min(allowed, quota()) / local_ranks())
+
+
+def local_ranks() -> int:
+    """Processes of one run on this machine, as torchrun says."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
 
 
 def quota() -> float:

@@ -27,6 +27,7 @@ class Approach:
     Args:
         robot: built like the KR 16.
         standoff_m: how far behind the pose the way begins; or as far as the joint limits allow.
+        threads: that work them out; None: one for each core that may be used.
 
     Attributes:
         knots: of every way, 2 k + 1 for k legs.
@@ -36,7 +37,7 @@ class Approach:
             `MAX_STANDOFF_M`.
     """
 
-    def __init__(self, robot: Robot, standoff_m: float):
+    def __init__(self, robot: Robot, standoff_m: float, threads: int | None = None):
         if not 0.0 <= standoff_m <= MAX_STANDOFF_M:
             raise ValueError(
                 f"environment.standoff_m {standoff_m} m: no arm comes from so far; give over 0 and "
@@ -45,7 +46,7 @@ class Approach:
         self._arm, self._last_link = arm_lengths(robot), np.linalg.inv(robot.tooltip)
         self._lower_rad, self._upper_rad = robot.lower_rad, robot.upper_rad
         self._standoff_m = standoff_m
-        self._threads = ThreadPool()
+        self._threads = ThreadPool(threads)
         self.knots = 2 * max(1, math.ceil(standoff_m / LEG_M - 1e-9)) + 1
 
     def __call__(self, tooltip_m: Floats, yaw_rad: Floats) -> tuple[Path, Floats]:

@@ -64,6 +64,7 @@ class Arm:
         workspace: what actions map onto.
         standoff_m: how far behind a pose it is approached from, or as far as the joint limits
             allow; 0: a motion is one leg through joint space.
+        threads: that work out motions; None: one for each core that may be used.
 
     Attributes:
         robot: what it was made with.
@@ -72,8 +73,14 @@ class Arm:
         ValueError: a pose of the workspace is out of reach, or cannot be approached straight.
     """
 
-    def __init__(self, robot: Robot, workspace: Workspace, standoff_m: float):
-        self.robot, self._approach = robot, Approach(robot, standoff_m)
+    def __init__(
+        self,
+        robot: Robot,
+        workspace: Workspace,
+        standoff_m: float,
+        threads: int | None = None,
+    ):
+        self.robot, self._approach = robot, Approach(robot, standoff_m, threads)
         ranges = (workspace.x_m, workspace.y_m, workspace.z_m, np.radians(workspace.yaw_deg))
         self._low, self._high = np.array(ranges, float).T
         home = tooltip_pose(robot, robot.home_rad)
@@ -84,7 +91,7 @@ class Arm:
     def of(cls, settings: GraspSettings, robot: Robot) -> Arm:
         """A task's arm."""
         standoff_m = settings.standoff_m if settings.motion == "standoff" else 0.0
-        return cls(robot, settings.workspace, standoff_m)
+        return cls(robot, settings.workspace, standoff_m, settings.threads)
 
     def home(self, n: int) -> Tools:
         """N robots in their home pose."""

@@ -84,7 +84,7 @@ class SceneSampler:
         self._rules = rules(settings)
         around = settings.randomize.surroundings
         self._around = None if around is None else surroundings.surrounding_rules(settings, around)
-        self._threads = ThreadPool()
+        self._threads = ThreadPool(settings.threads)
 
     def sample(
         self, rng: np.random.Generator, yaw_limit_rad: Floats

@@ -46,5 +46,4 @@ def _fast(settings: GraspSettings, robot: Robot, num_worlds: int, window: bool) 
         raise ValueError(
             "simulator: fast has no window: use simulator: pybullet, or render_mode: rgb_array"
         )
-    threads = None if settings.workers is None else max(settings.workers, 1)
-    return FastSimulator(num_worlds, robot, settings.support, threads)
+    return FastSimulator(num_worlds, robot, settings.support, settings.threads)

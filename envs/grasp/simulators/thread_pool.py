@@ -42,13 +42,16 @@ class ThreadPool:
         if self._helpers is None or rows <= size:
             work(0, rows)
             return
-        begins = iter(range(0, rows, size))
+        parts = range(0, rows, size)
+        begins = iter(parts)
 
         def take_parts() -> None:
             for begin in begins:
                 work(begin, min(begin + size, rows))
 
-        helping = [self._helpers.submit(take_parts) for _ in range(self._threads - 1)]
+        helping = [
+            self._helpers.submit(take_parts) for _ in range(min(self._threads, len(parts)) - 1)
+        ]
         take_parts()
         for helper in helping:
             if not helper.cancel():

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -871,3 +872,11 @@ def test_the_space_of_a_sampled_camera_says_which_pixels_it_has(make: MakeEnv) -
     assert isinstance(space, DepthImage)
     assert space.sampling == Sampling(32, 24, 2, 4, 10, 7, 3)
     assert env.reset(seed=0)[0]["depth"].shape == (2, 7, 10, 1)
+
+
+def test_workers_are_all_the_threads_there_are(make: MakeEnv) -> None:
+    before = threading.active_count()
+    env = make(64, simulator="fast", workers=1)
+    env.reset(seed=0)
+    env.step(np.zeros((64, 4), np.float32))
+    assert threading.active_count() == before

@@ -83,6 +83,14 @@ def test_threads_are_no_more_than_the_quota_buys(
     assert usable_cores() == expected
 
 
+@pytest.mark.parametrize(("ranks", "expected"), [("2", 8), ("3", 6), ("64", 1)])
+def test_processes_of_torchrun_share_the_cores(
+    monkeypatch: pytest.MonkeyPatch, ranks: str, expected: int
+) -> None:
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", ranks)
+    assert usable_cores() == expected
+
+
 def test_without_an_affinity_all_cores_count(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_getaffinity")
     monkeypatch.setattr(os, "cpu_count", lambda: 10)
