@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import sys
 from pathlib import Path
 
 from trainers.comparison.jobs import CORES
@@ -11,6 +12,13 @@ from trainers.comparison.jobs import CORES
 ROOT = Path(__file__).parents[1]
 EXTRA = "bench"
 """Extra of ventosa's that has what is compared with, and draws."""
+
+
+def torchrun(count: int, *command: str) -> list[str]:
+    """The command line that has so many processes of this machine run a module together."""
+    launch = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", str(count)]
+    rendezvous = ["--rdzv-backend", "c10d", "--rdzv-endpoint", "localhost:0"]
+    return [*launch, *rendezvous, "-m", *command]
 
 
 def missing(*packages: str) -> list[str]:

@@ -14,14 +14,13 @@ from __future__ import annotations
 import argparse
 import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.command import ROOT
+from benchmarks.command import ROOT, torchrun
 from benchmarks.ranks.model import Measured, Model, Network
 from benchmarks.tables import table, write_between
 from trainers.common.command import tells_failures
@@ -93,11 +92,9 @@ def measure(
 
 def start(run_file: Path, count: int, path: Path, updates: int) -> None:
     """Has so many ranks measure, each with one thread, and write it to a file."""
-    launch = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", str(count)]
-    rendezvous = ["--rdzv-backend", "c10d", "--rdzv-endpoint", "localhost:0"]
-    rank = ["-m", "benchmarks.ranks.rank", str(path), str(run_file.resolve()), str(updates)]
+    rank = ("benchmarks.ranks.rank", str(path), str(run_file.resolve()), str(updates))
     subprocess.run(
-        [*launch, *rendezvous, *rank],
+        torchrun(count, *rank),
         cwd=ROOT,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         check=True,

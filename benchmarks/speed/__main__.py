@@ -73,12 +73,19 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         metavar="N",
         help="worlds and environments; environments are measured with N/4 (PyBullet's) and 4N, too",
     )
+    parser.add_argument(
+        "--ranks",
+        type=int,
+        default=1,
+        metavar="K",
+        help="of the part `training`: torchrun's processes of ventosa, a thread of torch each",
+    )
     parser.add_argument("--repeats", type=int, default=3, help="rounds, of which the median counts")
     parser.add_argument("--seconds", type=float, default=2.0, help="of a measurement, at least")
     parser.add_argument("--track", type=Path, metavar="FILE", help="add a line to this history")
     options = parser.parse_args(arguments)
     options.parts = options.parts or (PARTS if options.device == "cpu" else ("runs",))
-    for name, least in (("num_envs", MIN_ENVS), ("repeats", 1)):
+    for name, least in (("num_envs", MIN_ENVS), ("ranks", 1), ("repeats", 1)):
         if getattr(options, name) < least:
             parser.error(f"--{name.replace('_', '-')} must be at least {least}")
     return options

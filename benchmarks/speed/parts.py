@@ -42,7 +42,7 @@ def train(options: argparse.Namespace) -> Table:
     """Steps per second of the training loops."""
     found: Figures = {}
     sizes: dict[str, int] = {}
-    makers = contenders(peer=not missing(*PEER_PACKAGES))
+    makers = contenders(not missing(*PEER_PACKAGES), options.ranks)
     for size in track(options.sizes, "training", transient=True):
         for mode in MODES:
             figures, sizes[_image(size)] = training(

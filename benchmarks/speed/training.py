@@ -17,7 +17,9 @@ from rich.console import Console
 from benchmarks.speed.figures import MODES, OURS, PEER, Figures, race
 from trainers.algorithms.base import TrainerSettings
 from trainers.common.timers import Timer, recording
+from trainers.distributed.world import ALONE, World
 from trainers.reporting.event_log import RunLog
+from trainers.reporting.silent import SilentLog
 from trainers.reporting.summary import Summary
 from trainers.reporting.terminal import make_display
 from trainers.runfile.registry import load_registries
@@ -78,12 +80,16 @@ def load(size: int, mode: str, num_envs: int) -> RunSettings:
 class Ventosa:
     """Trains as `trainers.learn` does, summaries included; only checkpoints are left out."""
 
-    def __init__(self, run: RunSettings):
+    def __init__(self, run: RunSettings, world: World = ALONE):
         self._settings: TrainerSettings = run.trainer.settings  # type: ignore[assignment]
         with ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            self.session = stack.enter_context(closing(Session(run, load_registries())))
-            self._log = log = stack.enter_context(closing(RunLog(folder)))
+            self.session = stack.enter_context(
+                closing(Session(run, load_registries(), world=world))
+            )
+            self._log = log = stack.enter_context(
+                closing(RunLog(folder) if world.writes else SilentLog())
+            )
             self.session.reset()
             env = self.session.env_runner.env
             self._summary = Summary(log, "speed", env, 1, self._settings.summary_freq)
@@ -108,14 +114,19 @@ class _NoCheckpoints(Checkpoints):
         return Path()
 
 
-def contenders(peer: bool) -> Makers:
-    """What is compared: this project's trainer and, where it is installed, its peer."""
+def contenders(peer: bool, ranks: int = 1) -> Makers:
+    """What is compared: this project's trainer, on so many processes, and its peer if asked for."""
+    ours: Callable[[RunSettings], Contender] = Ventosa
+    if ranks > 1:
+        from benchmarks.speed.ranks import OfRanks  # noqa: PLC0415
+
+        ours = partial(OfRanks, ranks)
     if not peer:
-        return {OURS: Ventosa}
+        return {OURS: ours}
     # Imported late, for it needs the extra `bench`.
     from benchmarks.speed.stable_baselines import StableBaselines  # noqa: PLC0415
 
-    return {OURS: Ventosa, PEER: StableBaselines}
+    return {OURS: ours, PEER: StableBaselines}
 
 
 def training(

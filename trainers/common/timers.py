@@ -53,6 +53,14 @@ def timed(name: str) -> Iterator[None]:
         yield
 
 
+def add_timed(name: str, total_s: float) -> None:
+    """Adds a part that was timed elsewhere, such as in another process."""
+    parent = _current.get()
+    if parent is not None:
+        timer = parent.children.setdefault(name, Timer())
+        timer.total_s, timer.count = timer.total_s + total_s, timer.count + 1
+
+
 @contextmanager
 def _entered(timer: Timer) -> Iterator[None]:
     token, start_s = _current.set(timer), time.perf_counter()

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from benchmarks.speed import __main__ as speed
-from benchmarks.speed import parts, processes, training
+from benchmarks.speed import parts, processes, ranks, training
 from benchmarks.speed.figures import FRAME_GRAB, MODES, OURS, Case
 from benchmarks.speed.simulation import frames, steps
 
@@ -55,6 +55,20 @@ def test_training_beside_its_peer() -> None:
     # Convolutions 4x2x2 + 4 and 8x4x1x1 + 8 leave 8x4x4 of 32x32; two layers, two heads, a std.
     encoder, trunk = 4 * 4 + 4 + 8 * 4 + 8, 128 * 256 + 256 + 256 * 256 + 256
     assert parameters == encoder + trunk + 256 * 4 + 4 + 256 + 1 + 4
+
+
+def test_training_of_ranks() -> None:
+    makers = training.contenders(peer=False, ranks=2)
+    found, parameters = training.training("frame grab", 32, 16, 2, 0.001, makers)
+    collection, update, whole = (by["ventosa"].values for by in found.values())
+    assert all(both < min(each) for *each, both in zip(collection, update, whole, strict=True))
+    assert parameters > 100_000
+
+
+def test_ranks_that_end_are_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ranks, "torchrun", lambda *_: [sys.executable, "-c", "raise SystemExit(1)"])
+    with pytest.raises(RuntimeError, match="ranks have ended"):
+        ranks.OfRanks(2, training.load(32, FRAME_GRAB, 16))
 
 
 def test_without_the_extra_the_rest_is_measured(

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from trainers.common.timers import Timer, recording, timed
+from trainers.common.timers import Timer, add_timed, recording, timed
 
 
 def find(tree: dict[str, Any], *path: str) -> dict[str, Any]:
@@ -43,6 +43,17 @@ def test_a_part_holds_its_children_and_the_rest_is_its_own(monkeypatch: pytest.M
     assert find(tree, "outer")["total"] == 8.0  # from 1 to 9
     assert find(tree, "outer")["self"] == 5.0
     assert tree["total"] == 10.0
+
+
+def test_what_was_timed_elsewhere_is_a_part() -> None:
+    root = Timer()
+    add_timed("lost", 1.0)  # nothing records
+    with recording(root), timed("outer"):
+        add_timed("part", 0.25)
+        add_timed("part", 0.5)
+    assert find(root.tree(), "outer", "part")["total"] == 0.75
+    assert find(root.tree(), "outer", "part")["count"] == 2
+    assert len(root.children) == 1
 
 
 def test_an_error_ends_its_parts() -> None:
