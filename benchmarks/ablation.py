@@ -26,6 +26,7 @@ from trainers.common.command import tells_failures
 from trainers.common.errors import UserError
 from trainers.comparison.jobs import Job, run_missing
 from trainers.comparison.tables import markdown
+from trainers.learn import stop_on_signals
 
 RUN_FILES = ROOT / "config"
 CHANGES_FILE = Path(__file__).with_suffix(".yaml")
@@ -91,7 +92,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for seed in options.seeds
         for change in changes
     }
-    if code := run_missing(list(jobs.values()), options.jobs):
+    with stop_on_signals() as stop:
+        code = run_missing(list(jobs.values()), options.jobs, stop.requested)
+    if code:
         return code
     reports = {key: json.loads(job.results.read_text()) for key, job in jobs.items()}
     rows = [

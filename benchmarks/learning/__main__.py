@@ -23,6 +23,7 @@ from trainers.common.command import require_extra, tells_failures
 from trainers.common.errors import UserError
 from trainers.comparison.jobs import Job, run_missing
 from trainers.comparison.tables import markdown
+from trainers.learn import stop_on_signals
 from trainers.runfile.registry import load_registries
 
 
@@ -42,7 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ]
     if not all(job.results.exists() for job in jobs):
         require_extra(EXTRA, "stable_baselines3", "sb3_contrib", "mujoco")
-    return run_missing(jobs, options.jobs) or report(options, jobs)
+    with stop_on_signals() as stop:
+        code = run_missing(jobs, options.jobs, stop.requested)
+    return code or report(options, jobs)
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:

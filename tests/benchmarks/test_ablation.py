@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -106,3 +110,15 @@ def test_a_run_is_trained_then_evaluated(tmp_path: Path) -> None:
     assert evaluate[-2:] == ["--json", str(tmp_path / "run-x-1000-7.json")]
     assert str(tmp_path / "runs" / "run-x-1000-7") in evaluate
     assert "c=2" in evaluate
+
+
+def test_told_to_stop_it_stops_its_runs(tmp_path: Path) -> None:
+    run = tmp_path / "runs" / "run-none-1000000-0"
+    command = ["--changes", "none", "--seeds", "0", "--steps", "1000000", "--results", tmp_path]
+    with subprocess.Popen([sys.executable, "-m", "benchmarks.ablation", *command]) as process:
+        while not (run / "status.json").exists() and process.poll() is None:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=60.0) == 128 + signal.SIGTERM
+    assert json.loads((run / "status.json").read_text())["state"] == "interrupted"
+    assert not (run / "run.lock").exists()
