@@ -10,6 +10,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from trainers.saving.run_lock import LOCK
 
 REPOSITORY = Path(__file__).parents[2]
 STEPS, INTERVAL = 1536, 64
-LATEST_KILL_S, IN_PEACE_S = 3.0, 600.0
+LATEST_KILL_S, IN_PEACE_S = 2.0, 600.0
 ORPHANS_END_IN_S = 5.0
 PENDULUM = {"type": "gymnasium", "id": "Pendulum-v1", "num_envs": 4, "vectorization": "async"}
 GRASP = {
@@ -75,9 +76,9 @@ def processes_of(session: int) -> list[int]:
     return found
 
 
-def killed(process: subprocess.Popen[bytes], lock: Path, wait_s: float) -> bool:
-    """Kills a run that long after it began; False if it ended before, in peace."""
-    while not lock.exists() and process.poll() is None:
+def killed(process: subprocess.Popen[bytes], has_begun: Callable[[], bool], wait_s: float) -> bool:
+    """Kills a run that long after something has begun; False if it ended before, in peace."""
+    while not has_begun() and process.poll() is None:
         time.sleep(0.01)
     try:
         _, errors = process.communicate(timeout=wait_s)
@@ -90,15 +91,22 @@ def killed(process: subprocess.Popen[bytes], lock: Path, wait_s: float) -> bool:
 
 
 def runs_with_kills(config: Path, kills: int, seed: int) -> Iterator[Path]:
-    """Runs that came to their end after as many kills in all."""
-    moments = random.Random(seed)
+    """Runs that came to their end after as many kills in all.
+
+    Every other kill comes after a checkpoint of the process's own, however slow its start is; the
+    rest at any moment from its lock on.
+    """
+    moments, resumed = random.Random(seed), 0
     for number in range(kills):
         folder = config.parent / "results" / f"killed{number}"
         while True:
-            saved = any(folder.glob("checkpoints/step-*"))
-            process = start(config, "--run-id", folder.name, "--resume" if saved else "--force")
+            before = checkpoints(folder)
+            process = start(config, "--run-id", folder.name, "--resume" if before else "--force")
+            resumed += bool(before)
             wait_s = moments.uniform(0.0, LATEST_KILL_S) if kills else IN_PEACE_S
-            if not killed(process, folder / LOCK, wait_s):
+            has_saved = partial(newly_saved, folder, before)
+            has_begun = has_saved if kills % 2 else (folder / LOCK).exists
+            if not killed(process, has_begun, wait_s):
                 break
             kills -= 1
             deadline = time.monotonic() + ORPHANS_END_IN_S
@@ -107,7 +115,18 @@ def runs_with_kills(config: Path, kills: int, seed: int) -> Iterator[Path]:
                 time.sleep(0.1)
         yield folder
         if not kills:
+            assert resumed
             return
+
+
+def checkpoints(folder: Path) -> set[str]:
+    """Names of a run's checkpoints."""
+    return {path.name for path in folder.glob("checkpoints/step-*")}
+
+
+def newly_saved(folder: Path, before: set[str]) -> bool:
+    """Whether a run has checkpoints that it had not before."""
+    return bool(checkpoints(folder) - before)
 
 
 def saved(folder: Path) -> Loaded:

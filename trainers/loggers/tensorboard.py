@@ -36,6 +36,7 @@ class TensorBoard(Logger):
 
     def __init__(self, settings: Settings, run: LoggedRun):
         step = run.resumed_at
+        self._goes_on = step is not None
         if step is not None:
             cut_after(run.directory, step)
         # TensorBoard purges from `purge_step` on, that step included.
@@ -77,7 +78,12 @@ class TensorBoard(Logger):
             self._writer._get_file_writer().add_summary(summary, step)
 
     def hyperparameters(self, values: Mapping[str, Any], tags: Sequence[str]) -> None:
-        """See `Logger.hyperparameters`; TensorBoard shows them on its page HParams."""
+        """See `Logger.hyperparameters`; TensorBoard shows them on its page HParams.
+
+        A run that goes on has them already: those that can be told apart by them have not changed.
+        """
+        if self._goes_on:
+            return
         # The third would say that the run has ended.
         about, begun, _ = hparams(flat(values), dict.fromkeys(tags, 0.0))
         with self._written():
