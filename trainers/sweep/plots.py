@@ -181,6 +181,7 @@ def draw_parallel(
     axis.set_xticks(range(len(space) + 1), [*(scale.label for scale in scales.values()), "score"])
     axis.set_yticks([])
     axis.set_xlim(-0.5, len(space) + 0.1)
+    axis.set_ylim(-0.05, 1.05)
     axis.spines[:].set_visible(False)
     for file in files:
         figure.savefig(file, dpi=110)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from trainers.sweep.plan import Range
-from trainers.sweep.plots import Scale, cell_means, labels
+from trainers.sweep.plots import Scale, Scored, cell_means, draw_heat_maps, draw_parallel, labels
 
 BATCH = Scale("batch", Range(choice=(64, 128, 256)))
 RATE = Scale("rate", Range(log_uniform=(1e-4, 1e1)))
@@ -44,3 +46,14 @@ def test_labels_are_as_short_as_they_can_be() -> None:
     keys = ["trainer.hyperparameters.beta", "seed", "rewards.0.weight", "rewards.1.weight"]
     assert list(labels(keys).values()) == ["beta", "seed", "0.weight", "1.weight"]
     assert labels(["a.seed", "seed"]) == {"a.seed": "a.seed", "seed": "seed"}
+
+
+@pytest.mark.filterwarnings("error")
+def test_one_trial_is_enough_to_draw(tmp_path: Path) -> None:
+    space = {"rate": Range(choice=(1e-3, 1e-2)), "seed": Range(uniform=(0, 1))}
+    only = Scored({"rate": 1e-3, "seed": 0.5}, 217.0)
+    for draw in (draw_heat_maps, draw_parallel):
+        file = tmp_path / "drawn.png"
+        draw(space, [only], [file])
+        assert file.read_bytes().startswith(b"\x89PNG")
+        file.unlink()
