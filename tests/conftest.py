@@ -185,6 +185,10 @@ class DartsEnvironment(TargetEnvironment):
         none = settings.model_copy(update={"episode_steps": 0})
         return {"one throw": settings.model_copy(update={"episode_steps": 1}), "no throw": none}
 
+    def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        near = self._settings.episode_steps == 2
+        return super().draw(rng, count) * (0.75 if near else 1.0)
+
     def reset(self, **options: Any) -> tuple[Any, ...]:
         if self._settings.episode_steps == 0:
             raise ValueError("nobody may throw")

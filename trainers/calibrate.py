@@ -20,7 +20,7 @@ from trainers.common.options import (
 if TYPE_CHECKING:
     from trainers.inference.confidence import Card, Measured
 
-EPISODES = 80_000
+EPISODES = 200_000
 
 
 @tells_failures
@@ -35,6 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.policy,
         episodes=options.episodes,
         seed=options.seed,
+        overrides=options.overrides,
         results_dir=options.results_dir,
         trust=options.trust,
     )
@@ -53,11 +54,19 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "policy", help="a run (its best checkpoint), a checkpoint's or an exported folder"
     )
+    parser.add_argument(
+        "overrides",
+        nargs="*",
+        default=[],
+        metavar="KEY=VALUE",
+        help="a dotted path into the run's file, such as environment.num_envs=16: the promise is "
+        "of that task (default: as trained)",
+    )
     parser.add_argument("--episodes", type=positive, default=EPISODES, help="how many")
     parser.add_argument("--seed", type=seed_number, default=0, help="of the episodes")
     add_trust_option(parser)
     add_results_option(parser)
-    return parser.parse_args(arguments)
+    return parser.parse_intermixed_args(arguments)
 
 
 def told(card: Card) -> Iterator[str]:
@@ -75,11 +84,11 @@ def told(card: Card) -> Iterator[str]:
         yield f"sure is a probability of that of {card.threshold:.4f} or more"
     if card.measured is not None:
         yield f"wanted: {card.target:.1%} of the sure are right; measured in other episodes:"
-        yield from _measured(card.measured)
+        yield from _measured(card.measured, " ".join(card.overrides) or "as trained")
 
 
-def _measured(measured: Measured) -> Iterator[str]:
-    for name, counts in {"as trained": measured.ordinary, **measured.harder}.items():
+def _measured(measured: Measured, promised: str) -> Iterator[str]:
+    for name, counts in {promised: measured.ordinary, **measured.harder}.items():
         right = f", of which {counts.sure_right / counts.sure:.2%} right" if counts.sure else ""
         yield (
             f"  {name}: {counts.right / counts.actions:.2%} of {counts.actions} right; "

@@ -157,7 +157,7 @@ def evaluate(
     acting = _load(policy, results_dir, run.device, seed)
     count = episodes or run.environment.cls.evaluation_episodes
     with closing(evaluation_environment(run, count)) as env, ExitStack() as stack:
-        _check_spaces(acting, env)
+        check_spaces(acting, env)
         evaluator = env.evaluator()
         physical, shown = None, _Shown()
         if check:
@@ -249,7 +249,7 @@ def _load(policy: str, results_dir: Path, device: str, seed: int) -> SavedPolicy
     return Policy.load(policy, results_dir=results_dir, device=device, seed=seed)
 
 
-def _check_spaces(policy: SavedPolicy, env: Environment) -> None:
+def check_spaces(policy: SavedPolicy, env: Environment) -> None:
     """Refuses an environment that shows or takes something else than the policy was trained on.
 
     Raises:

@@ -75,7 +75,7 @@ def test_a_policy_knows_when_it_hits(
     assert "  no throw: " not in said
     assert "no throw: left out, for it can't be had here: nobody may throw" in caplog.text
     policy = Policy.load("toy", results_dir=results)
-    goals = np.random.default_rng(0).uniform(-0.8, 0.8, (400, 2)).astype(np.float32)
+    goals = np.random.default_rng(0).uniform(-0.8, 0.8, (4000, 2)).astype(np.float32)
     answer = policy.answer(goals)
     np.testing.assert_array_equal(answer.actions, policy.predict(goals)[0])
     distance = np.linalg.norm(answer.actions - goals, axis=1)
@@ -147,6 +147,7 @@ def test_each_part_of_the_episodes_serves_one_purpose(
     calibration.learned(
         card,
         numbered(0, right=True),
+        numbered(500, right=True),
         {"windy": numbered(1000, right=True)},
         {"dark": numbered(2000, right=False)},
         {"odd": numbered(3000, right=False)},
@@ -155,9 +156,37 @@ def test_each_part_of_the_episodes_serves_one_purpose(
     assert not fitted & chosen
     assert not fitted & measured
     assert not chosen & measured
-    assert chosen < set(numbered(0, right=True).features[:, 0].tolist())
+    assert set(numbered(0, right=True).features[:, 0].tolist()) < fitted
+    assert chosen | measured > set(numbered(500, right=True).features[:, 0].tolist())
     assert set(numbered(3000, right=False).features[:, 0].tolist()) < measured
     assert len(fitted & set(map(float, range(1000, 1200)))) == 110
+
+
+def test_the_promise_may_be_of_another_task(
+    learned: Callable[..., Path], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """An easier one, so that more can be called sure of it."""
+    results = learned(trainer={"trainer_type": "ddpg"})
+    near, confidences = "environment.episode_steps=2", []
+    for overrides in ([], [near]):
+        assert calibrate(results, *overrides) == DONE
+        confidences.append(Policy.load("toy", results_dir=results).confidence)
+    trained, promised = (found.card for found in confidences if found is not None)
+    assert (trained.overrides, promised.overrides) == ((), (near,))
+    assert promised.threshold < trained.threshold
+    assert trained.measured is not None
+    assert promised.measured is not None
+    assert promised.measured.ordinary.actions == trained.measured.ordinary.actions == 300
+    of = {name: counts.sure / counts.actions for name, counts in promised.measured.harder.items()}
+    easy = promised.measured.ordinary
+    assert easy.sure / easy.actions > of["as trained"]
+    assert easy.sure_right / easy.sure >= 0.9
+    assert "as trained" not in trained.measured.harder
+    said = capfd.readouterr().out
+    assert f"  {near}: " in said
+    assert said.count("  as trained: ") == 2
+    assert calibrate(results, "environment.episode_step=2") == MISTAKE
+    assert "episode_steps" in capfd.readouterr().err
 
 
 def test_it_goes_where_the_weights_go(

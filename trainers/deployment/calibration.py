@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +19,7 @@ from trainers.common.files import write_atomically
 from trainers.evaluation import (
     SEEDS_PER_BATCH,
     RecordedPolicy,
+    check_spaces,
     evaluation_environment,
     find_run,
     first_actions,
@@ -52,13 +53,16 @@ _logger = logging.getLogger("ventosa")
 
 TARGET = 0.995
 """Share of what is called sure that is to be right."""
-MISTAKES_ALLOWED = 0.8
+MISTAKES_ALLOWED = 0.9
 """Share of the mistakes that the target allows with which the threshold is chosen already."""
 FIRST_SEED = SEEDS_PER_BATCH
 """From here to `SEEDS_PER_BATCH` / 2 further on, neither runs nor evaluations have any seed."""
+SEEDS_PER_PURPOSE = 2**16 * SEEDS_PER_BATCH
+"""From the seeds of episodes for one purpose to those for the next."""
 LEAST_EPISODES = 100
 SHARES = (0.55, 0.30)
 """Of the episodes: to fit in, and to choose the threshold in; the rest is to measure in."""
+AS_TRAINED = "as trained"
 EPISODES_PER_UNANSWERABLE = 40
 """There is one observation of each kind that can't be answered for so many episodes."""
 EPISODES_PER_HARDER = 20
@@ -70,6 +74,7 @@ def calibrate(
     *,
     episodes: int,
     seed: int = 0,
+    overrides: Sequence[str] = (),
     results_dir: Path = Path("results"),
     trust: bool = False,
 ) -> tuple[Path, Card]:
@@ -79,6 +84,9 @@ def calibrate(
         name: a run (its best checkpoint), a checkpoint's or an exported folder.
         episodes: how many first actions to learn from, choose the threshold by, and measure with.
         seed: of the episodes, which neither a run nor an evaluation has; below `SEED_LIMIT`.
+        overrides: `KEY=VALUE`s on top of the run's own configuration: the task that the promise is
+            of, where that is not the one that the policy was trained for. It is fitted to the
+            latter all the same.
         results_dir: where a run is looked for by its id.
         trust: see `trainers.evaluation.find_run`.
 
@@ -87,7 +95,8 @@ def calibrate(
 
     Raises:
         UserError: there is no such policy, it can't be learned how sure it is, its environment
-            does not say when an action is right, or the file can't be written.
+            does not say when an action is right, the task that the promise is of shows or takes
+            something else, or the file can't be written.
         EnvironmentFailure: the environment broke down.
     """
     if is_onnx(name):
@@ -98,9 +107,13 @@ def calibrate(
         )
     folder = find_checkpoint(name, results_dir).path
     _, run = find_run(name, (), results_dir, trust=trust)
+    _, promised_run = find_run(name, overrides, results_dir, trust=trust)
     policy = Policy.load(name, results_dir=results_dir, full_precision=True)
-    with closing(evaluation_environment(run, episodes)) as env:
-        features, metrics = _answered(policy, env, episodes, FIRST_SEED + seed)
+    with closing(evaluation_environment(promised_run, 1)) as env:
+        check_spaces(policy, env)  # before the minutes that all else takes
+    fitted = int(SHARES[0] * episodes)
+    with closing(evaluation_environment(run, fitted)) as env:
+        features, metrics = _answered(policy, env, fitted, FIRST_SEED + seed)
         evaluator = env.evaluator()
         card = Card(
             weights_sha256=weights_digest(folder),
@@ -109,13 +122,15 @@ def calibrate(
             target=TARGET,
             episodes=episodes,
             seed=seed,
+            overrides=tuple(overrides),
         )
-        ordinary = _examples(card, features, metrics)
+        trained = _examples(card, features, metrics)
         foreseen, unforeseen = _unanswered(
             policy, env, episodes // EPISODES_PER_UNANSWERABLE, seed, len(card.estimated)
         )
+    promised = _task(policy, promised_run, card, episodes - fitted, purpose=1)
     harder = dict(_harder(policy, run, card))
-    confidence = learned(card, ordinary, harder, foreseen, unforeseen)
+    confidence = learned(card, trained, promised, harder, foreseen, unforeseen)
     try:
         write_atomically(folder / FILE, to_bytes(confidence))
     except OSError as error:
@@ -128,20 +143,27 @@ Kinds = Mapping[str, Examples]
 
 
 def learned(
-    card: Card, ordinary: Examples, harder: Kinds, foreseen: Kinds, unforeseen: Kinds
+    card: Card,
+    trained: Examples,
+    promised: Examples,
+    harder: Kinds,
+    foreseen: Kinds,
+    unforeseen: Kinds,
 ) -> Confidence:
     """A confidence that was fitted, given its threshold, and measured, each in a part of its own.
 
     Args:
         card: what is known before.
-        ordinary: of the task that the policy was trained for.
+        trained: of the task that the policy was trained for, to fit with.
+        promised: of the task that the promise is of, to choose the threshold with and to measure.
         harder: of others.
         foreseen: before what can't be answered.
         unforeseen: the same, left for the measuring.
     """
-    confidence, chosen = Confidence(card), ordinary[_parts(ordinary)[1]]
+    confidence, choosing = Confidence(card), int(len(promised) * SHARES[1] / (1.0 - SHARES[0]))
+    chosen, kept = promised[:choosing], promised[choosing:]
     others = [each[_parts(each)[0]] for each in (*harder.values(), *foreseen.values())]
-    fit(confidence, ordinary[_parts(ordinary)[0]], joined([chosen[:0], *others]), card.seed)
+    fit(confidence, trained, joined([chosen[:0], *others]), card.seed)
     rescale(confidence, chosen)
     refused = joined([chosen[:0], *(each[_parts(each)[1]] for each in foreseen.values())])
     with torch.no_grad():
@@ -156,7 +178,7 @@ def learned(
     confidence.card = confidence.card.model_copy(update={"threshold": threshold})
     rest = {kind: each[_parts(each)[2]] for kind, each in foreseen.items()}
     measured = Measured(
-        ordinary=_counts(confidence, ordinary[_parts(ordinary)[2]]),
+        ordinary=_counts(confidence, kept),
         harder={what: _counts(confidence, each[_parts(each)[2]]) for what, each in harder.items()},
         unanswerable={
             k: _counts(confidence, each) for k, each in (rest | dict(unforeseen)).items()
@@ -185,15 +207,22 @@ def _counts(confidence: Confidence, examples: Examples) -> Counts:
 
 
 def _harder(policy: Policy, run: RunSettings, card: Card) -> Iterator[tuple[str, Examples]]:
-    """Examples of the harder tasks that can be had, by what is harder in them."""
+    """Examples of other tasks that can be had, by what is harder in them."""
     count = card.episodes // EPISODES_PER_HARDER
-    for what, settings in run.environment.cls.harder(run.environment.settings).items():
+    tasks = {AS_TRAINED: run.environment.settings} if card.overrides else {}
+    for what, settings in {**tasks, **run.environment.cls.harder(run.environment.settings)}.items():
         other = replace(run, environment=replace(run.environment, settings=settings))
-        with closing(evaluation_environment(other, count)) as env:
-            try:
-                yield what, _examples(card, *_answered(policy, env, count, FIRST_SEED + card.seed))
-            except ValueError as error:
-                _logger.warning("%s: left out, for it can't be had here: %s", what, error)
+        try:
+            yield what, _task(policy, other, card, count, purpose=2)
+        except ValueError as error:
+            _logger.warning("%s: left out, for it can't be had here: %s", what, error)
+
+
+def _task(policy: Policy, run: RunSettings, card: Card, count: int, purpose: int) -> Examples:
+    """So many examples of a task, with seeds of their own for each purpose."""
+    seed = FIRST_SEED + card.seed + purpose * SEEDS_PER_PURPOSE
+    with closing(evaluation_environment(run, count)) as env:
+        return _examples(card, *_answered(policy, env, count, seed))
 
 
 def _answered(policy: Policy, env: Environment, episodes: int, seed: int) -> tuple[Tensor, Metrics]:

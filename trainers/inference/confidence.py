@@ -88,7 +88,7 @@ class Measured(BaseModel, frozen=True, extra="forbid"):
     """What came of it in episodes that served nothing else.
 
     Attributes:
-        ordinary: of the task that the policy was trained for.
+        ordinary: of the task that the promise is of.
         harder: of others, by what was harder in them.
         unanswerable: by kind, before what can't be answered; none of these actions is right.
     """
@@ -112,6 +112,8 @@ class Card(BaseModel, frozen=True, extra="forbid"):
         target: share of the sure actions that is to be right.
         episodes: of all that was drawn.
         seed: of them.
+        overrides: `KEY=VALUE`s on top of the policy's own run file, of the task that the promise is
+            of: of so many sure actions in it `target` are right.
         measured: in a part of them that served nothing else.
     """
 
@@ -124,6 +126,7 @@ class Card(BaseModel, frozen=True, extra="forbid"):
     target: float
     episodes: NonNegativeInt
     seed: NonNegativeInt
+    overrides: tuple[str, ...] = ()
     measured: Measured | None = None
 
     @property

@@ -14,7 +14,8 @@ from torch.nn import functional as F
 
 from trainers.inference.confidence import NEVER, STEPS_OF_LIMIT, Confidence
 
-OPTIMIZER_STEPS = 800
+EPOCHS = 8
+LEAST_STEPS = 800
 BATCH_SIZE = 512
 LEARNING_RATE = 4e-3
 WEIGHT_DECAY = 1e-2
@@ -82,16 +83,17 @@ def fit(confidence: Confidence, ordinary: Examples, others: Examples, seed: int)
             if isinstance(layer, nn.Linear):
                 layer.reset_parameters()
     examples = joined([ordinary, others])
-    inputs = confidence.standardized(examples.features)
     right = examples.right.float()
     over = (examples.errors[:, :, None] > torch.tensor(STEPS_OF_LIMIT)).float()
     parameters = list(confidence.head.parameters())
     optimizer = torch.optim.AdamW(parameters, LEARNING_RATE, weight_decay=WEIGHT_DECAY)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, OPTIMIZER_STEPS)
-    for _ in range(OPTIMIZER_STEPS):
-        rows = torch.randint(len(inputs), (BATCH_SIZE,), generator=generator)
-        noise = FEATURE_NOISE * torch.randn((BATCH_SIZE, inputs.shape[1]), generator=generator)
-        told_right, told_over = confidence.logits(inputs[rows] + noise)
+    steps = max(LEAST_STEPS, EPOCHS * len(examples) // BATCH_SIZE)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, steps)
+    for _ in range(steps):
+        rows = torch.randint(len(examples), (BATCH_SIZE,), generator=generator)
+        inputs = confidence.standardized(examples.features[rows])
+        noise = FEATURE_NOISE * torch.randn(inputs.shape, generator=generator)
+        told_right, told_over = confidence.logits(inputs + noise)
         loss = F.binary_cross_entropy_with_logits(told_right, right[rows])
         if told_over.numel():
             sizes = F.binary_cross_entropy_with_logits(told_over, over[rows])
