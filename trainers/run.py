@@ -159,6 +159,7 @@ def _learn(
             if held_out.begins_due and (resumed is None or resumed.score is None):
                 held_out.log(log)
             summary.note_evaluation(held_out.latest)
+        summary.status(session.position, "running")
         training = Training(
             session, settings, log, summary, checkpoints, display, held_out, resumed
         )

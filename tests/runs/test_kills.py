@@ -43,7 +43,11 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
         "rewards": [{"type": "touch"}, {"type": "approach"}],
     },
 }
-HYPERPARAMETERS = {"ppo": {"buffer_size": 64}, "trpo": {"buffer_size": 64}, "ddpg": {}}
+HYPERPARAMETERS = {
+    "ppo": {"buffer_size": 64},
+    "trpo": {"buffer_size": 64},
+    "ddpg": {"save_replay_buffer": True},
+}
 SOAKED = [
     pytest.param(algorithm, environment, 50, marks=pytest.mark.soak)
     for algorithm in HYPERPARAMETERS

@@ -53,8 +53,6 @@ _logger = logging.getLogger("ventosa")
 
 TARGET = 0.995
 """Share of what is called sure that is to be right."""
-MISTAKES_ALLOWED = 0.9
-"""Share of the mistakes that the target allows with which the threshold is chosen already."""
 FIRST_SEED = SEEDS_PER_BATCH
 """From here to `SEEDS_PER_BATCH` / 2 further on, neither runs nor evaluations have any seed."""
 SEEDS_PER_PURPOSE = 2**16 * SEEDS_PER_BATCH
@@ -173,7 +171,7 @@ def learned(
             confidence(chosen.features).probability.numpy(),
             chosen.right.numpy(),
             confidence(refused.features).probability.numpy(),
-            1.0 - MISTAKES_ALLOWED * (1.0 - card.target),
+            card.target,
         )
     confidence.card = confidence.card.model_copy(update={"threshold": threshold})
     rest = {kind: each[_parts(each)[2]] for kind, each in foreseen.items()}

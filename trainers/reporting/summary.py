@@ -72,8 +72,10 @@ class Summary:
         self._summary_freq = summary_freq
         self._averager = Averager()
         self._last: dict[str, float] = {}
-        self._summaries = 0
-        self._next_summary = start_step
+        self._picture_freq = SUMMARIES_PER_PICTURE * summary_freq
+        # A run begins with both; one that is resumed has them when it would have had them.
+        self._next_summary = _next_multiple(start_step, summary_freq) if start_step else 0
+        self._next_picture = _next_multiple(start_step, self._picture_freq) if start_step else 0
         self._start_s = self._summary_s = time.monotonic()
         self._summary_step = start_step
         self._checkpoint: str | None = None
@@ -125,7 +127,7 @@ class Summary:
         if position.step < self._next_summary:
             display.advance(self._line(position))
             return
-        self._next_summary = (position.step // self._summary_freq + 1) * self._summary_freq
+        self._next_summary = _next_multiple(position.step, self._summary_freq)
         self._summarize(position, observations)
         display.update(self._line(position))
 
@@ -171,9 +173,9 @@ class Summary:
             means["Environment/Lesson Number/lesson"] = position.lesson + 1
         self._summary_s, self._summary_step = now, step
         self._log.scalars(means, step)
-        if self._summaries % SUMMARIES_PER_PICTURE == 0:
+        if step >= self._next_picture:
+            self._next_picture = _next_multiple(step, self._picture_freq)
             self._show_observations(observations, step)
-        self._summaries += 1
         self._last |= means
         self.status(position, "running")
 
@@ -199,3 +201,8 @@ def metric_tag(metric: str, figures: Sequence[Figure]) -> str:
         return SUCCESS_TAG
     name = next((figure.name for figure in figures if figure.metric == metric), metric)
     return f"Environment/{name.replace('_', ' ').title()}"
+
+
+def _next_multiple(step: int, interval: int) -> int:
+    """The first multiple of an interval that is beyond a step."""
+    return (step // interval + 1) * interval
