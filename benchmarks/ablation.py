@@ -94,6 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     }
     with stop_on_signals() as stop:
         code = run_missing(list(jobs.values()), options.jobs, stop.requested)
+    if stop.requested():
+        return stop.exit_code
     if code:
         return code
     reports = {key: json.loads(job.results.read_text()) for key, job in jobs.items()}

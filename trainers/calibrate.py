@@ -59,8 +59,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         nargs="*",
         default=[],
         metavar="KEY=VALUE",
-        help="a dotted path into the run's file, such as environment.num_envs=16: the promise is "
-        "of that task (default: as trained)",
+        help="a dotted path into the run's file, such as environment.randomize.surroundings=null: "
+        "the promise is of that task (default: as trained)",
     )
     parser.add_argument("--episodes", type=positive, default=EPISODES, help="how many")
     parser.add_argument("--seed", type=seed_number, default=0, help="of the episodes")

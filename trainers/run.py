@@ -40,7 +40,7 @@ from trainers.reporting.overview import (
 )
 from trainers.reporting.pace import Pace
 from trainers.reporting.silent import SilentLog
-from trainers.reporting.summary import Summary
+from trainers.reporting.summary import LATEST, SINCE_SUMMARY, Summary
 from trainers.reporting.terminal import make_display
 from trainers.runfile.changes import changeable, changes
 from trainers.runfile.registry import Registries, load_registries
@@ -159,6 +159,9 @@ def _learn(
             if held_out.begins_due and (resumed is None or resumed.score is None):
                 held_out.log(log)
             summary.note_evaluation(held_out.latest)
+        if resumed is not None:
+            summary.load_state_dict(resumed.state)
+            summary.note_checkpoint(resumed.path)
         summary.status(session.position, "running")
         training = Training(
             session, settings, log, summary, checkpoints, display, held_out, resumed
@@ -442,8 +445,10 @@ def _load(session: Session, resumed: Loaded) -> None:
         ValueError: the state is not of the session's kind, or of another step than it is said to
             be; whatever else a state leads to that is of the right kind, and doesn't fit.
     """
-    state, scoring = session.own_state(resumed.state), Averager()
-    own = {"step": 0, SCORING: scoring.state_dict(), **session.state_dict()}
+    state = session.own_state(resumed.state)
+    averagers = {name: Averager() for name in (SCORING, SINCE_SUMMARY, LATEST)}
+    means = {name: averager.state_dict() for name, averager in averagers.items()}
+    own = {"step": 0, **means, **session.state_dict()}
     weights = session.algorithm.policy.current_weights(resumed.weights)
     if wrong := mismatch(state, own) or mismatch(weights, session.weights(), "weights"):
         raise ValueError(wrong)
@@ -452,8 +457,8 @@ def _load(session: Session, resumed: Loaded) -> None:
     steps = {state["step"], session.env_runner.step_count, resumed.step}
     if len(steps) > 1:
         raise ValueError(f"it is said to be of several steps: {', '.join(map(str, sorted(steps)))}")
-    if SCORING in state:  # not in those of former versions
-        scoring.load_state_dict(state[SCORING])
+    for name in averagers.keys() & state.keys():  # not all are in those of former versions
+        averagers[name].load_state_dict(state[name])
 
 
 def _flags(options: argparse.Namespace) -> list[str]:

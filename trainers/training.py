@@ -71,7 +71,7 @@ class Training:
         self._session, self._settings, self._held_out = session, settings, held_out
         self._log, self._summary, self._display = log, summary, display
         self._checkpoints = checkpoints
-        self._since_save = Averager()
+        self._since_save, self._summary_state = Averager(), summary.state_dict()
         self._saved_step: int | None = None
         self._saved_score: float | None = None
         if resumed is not None:
@@ -99,7 +99,7 @@ class Training:
         env_runner, max_steps = self._session.env_runner, self._settings.max_steps
         interval = self._settings.checkpoint_interval
         # Between an update and the next collection is where a run can be taken up again.
-        present = self._session.resumable()
+        present = self._resumable()
         if self._saved_step is not None:
             self._save(present)  # its evaluation was cut off, and is made up for
         while env_runner.step_count < max_steps:
@@ -111,7 +111,7 @@ class Training:
                 if self._session.world.any(copy is None):
                     copy = None  # then none is stopped half way
             self._update(copy, before.step / max_steps)
-            present = self._session.resumable()
+            present = self._resumable()
             step = present.step
             with self._saved_if_cut_off(present):
                 evaluated = self._evaluate(step)
@@ -121,6 +121,11 @@ class Training:
                 return Ending(True, reached)
         self._save(present)
         return Ending(True, f"max_steps: {max_steps} steps were taken")
+
+    def _resumable(self) -> Resumable:
+        """What the run can be taken up from now; what the summary has belongs to it."""
+        self._summary_state = self._summary.state_dict()
+        return self._session.resumable()
 
     @contextmanager
     def _saved_if_cut_off(self, good: Resumable | None) -> Iterator[None]:
@@ -222,7 +227,8 @@ class Training:
         session = self._session
         with timed("checkpoint"):
             joined = session.joined_state(good.state)
-            state = {"step": step, SCORING: self._since_save.state_dict(), **joined}
+            own = {SCORING: self._since_save.state_dict(), **self._summary_state}
+            state = {"step": step, **own, **joined}
             with session.world.together():
                 if session.world.writes:
                     path = self._checkpoints.save(step, good.weights, state, score, score_of)

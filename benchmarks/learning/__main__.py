@@ -45,6 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         require_extra(EXTRA, "stable_baselines3", "sb3_contrib", "mujoco")
     with stop_on_signals() as stop:
         code = run_missing(jobs, options.jobs, stop.requested)
+    if stop.requested():
+        return stop.exit_code
     return code or report(options, jobs)
 
 

@@ -85,6 +85,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--track", type=Path, metavar="FILE", help="add a line to this history")
     options = parser.parse_args(arguments)
     options.parts = options.parts or (PARTS if options.device == "cpu" else ("runs",))
+    if options.num_envs % max(options.ranks, 1):
+        parser.error(f"--ranks {options.ranks} must divide --num-envs {options.num_envs}")
     for name, least in (("num_envs", MIN_ENVS), ("ranks", 1), ("repeats", 1)):
         if getattr(options, name) < least:
             parser.error(f"--{name.replace('_', '-')} must be at least {least}")

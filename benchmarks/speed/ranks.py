@@ -1,4 +1,7 @@
-"""This project's training loop on several of torchrun's processes, a thread each."""
+"""This project's training loop on several of torchrun's processes, a thread of torch each.
+
+They gather a checkpoint after each update, as they do where it is saved, which it is not here.
+"""
 
 from __future__ import annotations
 

@@ -116,9 +116,12 @@ def test_told_to_stop_it_stops_its_runs(tmp_path: Path) -> None:
     run = tmp_path / "runs" / "run-none-1000000-0"
     command = ["--changes", "none", "--seeds", "0", "--steps", "1000000", "--results", tmp_path]
     with subprocess.Popen([sys.executable, "-m", "benchmarks.ablation", *command]) as process:
-        while not (run / "status.json").exists() and process.poll() is None:
-            time.sleep(0.05)
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=60.0) == 128 + signal.SIGTERM
+        try:
+            while not (run / "status.json").exists() and process.poll() is None:
+                time.sleep(0.05)
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(timeout=120.0) == 128 + signal.SIGTERM
+        finally:
+            process.kill()
     assert json.loads((run / "status.json").read_text())["state"] == "interrupted"
     assert not (run / "run.lock").exists()

@@ -22,9 +22,10 @@ from trainers.saving.checkpoint import Checkpoints, Loaded
 from trainers.saving.run_lock import LOCK
 
 REPOSITORY = Path(__file__).parents[2]
-STEPS, INTERVAL = 1536, 64
+STEPS, INTERVAL, SUMMARIES_EACH = 1536, 64, 4
 LATEST_KILL_S, IN_PEACE_S = 2.0, 600.0
 ORPHANS_END_IN_S = 5.0
+OF_THE_CLOCK = ("Performance/", "_hparams_/")
 PENDULUM = {"type": "gymnasium", "id": "Pendulum-v1", "num_envs": 4, "vectorization": "async"}
 GRASP = {
     "type": "grasp",
@@ -101,7 +102,7 @@ def runs_with_kills(config: Path, kills: int, seed: int) -> Iterator[Path]:
     rest at any moment from its lock on.
     """
     moments, resumed = random.Random(seed), 0
-    for number in range(kills):
+    for number in range(3 + kills):  # some may end before they are killed
         folder = config.parent / "results" / f"killed{number}"
         while True:
             before = checkpoints(folder)
@@ -121,6 +122,7 @@ def runs_with_kills(config: Path, kills: int, seed: int) -> Iterator[Path]:
         if not kills:
             assert resumed
             return
+    raise AssertionError(f"{kills} kills came too late")
 
 
 def checkpoints(folder: Path) -> set[str]:
@@ -137,10 +139,14 @@ def saved(folder: Path) -> Loaded:
     return Checkpoints(folder / "checkpoints", keep=9).load_latest()
 
 
-def points(folder: Path) -> Counter[tuple[str, int]]:
-    """How often each point of each curve stands in the run's event files."""
+def points(folder: Path) -> Counter[tuple[str, int, bytes]]:
+    """How often each point of each curve stands in the run's event files, with its value."""
     return Counter(
-        (value.tag, event.step)
+        (
+            value.tag,
+            event.step,
+            b"" if value.tag.startswith(OF_THE_CLOCK) else value.tensor.SerializeToString(),
+        )
         for path in folder.glob(PATTERN)
         for event in EventFileLoader(str(path)).Load()
         for value in event.summary.value
@@ -155,7 +161,7 @@ def config(write_run: Callable[..., Path], algorithm: str, environment: str) -> 
         "trainer_type": algorithm,
         "max_steps": STEPS,
         "checkpoint_interval": INTERVAL,
-        "summary_freq": INTERVAL,
+        "summary_freq": SUMMARIES_EACH * INTERVAL,
         "hyperparameters": HYPERPARAMETERS[algorithm],
     }
     return write_run(parts.pop("environment"), trainer, **parts)

@@ -81,7 +81,7 @@ def test_a_policy_knows_when_it_hits(
     distance = np.linalg.norm(answer.actions - goals, axis=1)
     assert answer.sure.any()
     assert (distance[answer.sure] <= 0.7).mean() >= 0.9
-    assert np.corrcoef(answer.errors["distance_m"], distance)[0, 1] > 0.9
+    assert np.corrcoef(answer.errors["distance_m"], distance)[0, 1] > 0.8
     assert policy.confidence is not None
     np.testing.assert_array_equal(
         answer.sure, answer.probability >= np.float32(policy.confidence.card.threshold)

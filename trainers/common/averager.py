@@ -42,8 +42,9 @@ class Averager:
         return means
 
     def state_dict(self) -> dict[str, Any]:
-        """What was added, to go on from."""
-        return {"sums": dict(self._sums), "counts": dict(self._counts)}
+        """What was added, to go on from; without what is not finite."""
+        sums = {name: total for name, total in self._sums.items() if math.isfinite(total)}
+        return {"sums": sums, "counts": {name: self._counts[name] for name in sums}}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go back to a state.

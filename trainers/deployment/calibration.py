@@ -55,7 +55,7 @@ TARGET = 0.995
 """Share of what is called sure that is to be right."""
 FIRST_SEED = SEEDS_PER_BATCH
 """From here to `SEEDS_PER_BATCH` / 2 further on, neither runs nor evaluations have any seed."""
-SEEDS_PER_PURPOSE = 2**16 * SEEDS_PER_BATCH
+SEEDS_PER_PURPOSE = 2**24 * SEEDS_PER_BATCH
 """From the seeds of episodes for one purpose to those for the next."""
 LEAST_EPISODES = 100
 SHARES = (0.55, 0.30)
@@ -107,8 +107,9 @@ def calibrate(
     _, run = find_run(name, (), results_dir, trust=trust)
     _, promised_run = find_run(name, overrides, results_dir, trust=trust)
     policy = Policy.load(name, results_dir=results_dir, full_precision=True)
-    with closing(evaluation_environment(promised_run, 1)) as env:
-        check_spaces(policy, env)  # before the minutes that all else takes
+    if overrides:  # before the minutes that all else takes
+        with closing(evaluation_environment(promised_run, 1)) as env:
+            check_spaces(policy, env)
     fitted = int(SHARES[0] * episodes)
     with closing(evaluation_environment(run, fitted)) as env:
         features, metrics = _answered(policy, env, fitted, FIRST_SEED + seed)
@@ -264,7 +265,7 @@ def _unanswered(
     unforeseen: dict[str, list[Examples]] = {}
     batch = min(count, env.num_envs)
     for first in range(0, count, batch):
-        batch_seed = FIRST_SEED + seed + first * SEEDS_PER_BATCH
+        batch_seed = FIRST_SEED + seed + 3 * SEEDS_PER_PURPOSE + first * SEEDS_PER_BATCH
         for each in env.evaluator().unanswerable(batch, batch_seed):
             _, features = policy.first_actions(each.observations)
             kinds = foreseen if each.is_foreseen else unforeseen

@@ -108,12 +108,13 @@ class Card(BaseModel, frozen=True, extra="forbid"):
         errors: that make an action wrong where one of them is over its limit.
         threshold: least probability of being right that is called sure; `NEVER`: none is.
         farthest: features at a greater distance from those of training are like none of them: the
-            probability is 0, and errors are the largest that can be told.
+            probability is 0, and errors are the largest that can be told. All but one in a
+            thousand of the task that the promise is of are nearer.
         target: share of the sure actions that is to be right.
         episodes: of all that was drawn.
         seed: of them.
         overrides: `KEY=VALUE`s on top of the policy's own run file, of the task that the promise is
-            of: of so many sure actions in it `target` are right.
+            of; of the sure actions in it, the share `target` is right.
         measured: in a part of them that served nothing else.
     """
 

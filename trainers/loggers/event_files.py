@@ -18,9 +18,10 @@ class _Record(NamedTuple):
     end: int
     """Offset of the next one."""
     step: int
+    tags: tuple[str, ...]
 
 
-def cut_after(directory: Path, step: int) -> None:
+def cut_after(directory: Path, step: int) -> set[str]:
     """Cuts a run's event files before the first point of a later step.
 
     The run goes on from that step and logs those points again: whatever reads the files, and not
@@ -31,15 +32,22 @@ def cut_after(directory: Path, step: int) -> None:
         directory: the run's.
         step: that of the checkpoint from which the run goes on; points of that step stay.
 
+    Returns:
+        The tags of what stays.
+
     Raises:
         OSError: a file can't be read or cut.
     """
+    tags: set[str] = set()
     for path in directory.glob(PATTERN):
+        end = 0
         with path.open("rb") as file:
-            kept = takewhile(lambda record: record.step <= step, _records(file))
-            end = max((record.end for record in kept), default=0)
+            for record in takewhile(lambda record: record.step <= step, _records(file)):
+                end = record.end
+                tags.update(record.tags)
         if end < path.stat().st_size:
             os.truncate(path, end)
+    return tags
 
 
 def _records(file: BinaryIO) -> Iterator[_Record]:
@@ -54,7 +62,8 @@ def _records(file: BinaryIO) -> Iterator[_Record]:
         if file.tell() + length + _CHECKSUM > size:
             return
         try:
-            step = Event.FromString(file.read(length)).step
+            event = Event.FromString(file.read(length))
         except DecodeError:
             return
-        yield _Record(file.seek(_CHECKSUM, os.SEEK_CUR), step)
+        tags = tuple(value.tag for value in event.summary.value)
+        yield _Record(file.seek(_CHECKSUM, os.SEEK_CUR), event.step, tags)

@@ -22,6 +22,10 @@ IN_COLOR = 3
 """Colorspace of an image, as TensorBoard counts them."""
 
 
+HYPERPARAMETERS = "_hparams_/session_start_info"
+"""Tag of a run's hyper-parameters, as TensorBoard's page HParams looks for it."""
+
+
 class TensorBoard(Logger):
     """Logs into an event file; what it is given is in the file when a method returns.
 
@@ -36,9 +40,8 @@ class TensorBoard(Logger):
 
     def __init__(self, settings: Settings, run: LoggedRun):
         step = run.resumed_at
-        self._goes_on = step is not None
-        if step is not None:
-            cut_after(run.directory, step)
+        tags = set() if step is None else cut_after(run.directory, step)
+        self._has_hyperparameters = HYPERPARAMETERS in tags
         # TensorBoard purges from `purge_step` on, that step included.
         self._writer = SummaryWriter(
             str(run.directory), purge_step=None if step is None else step + 1
@@ -80,9 +83,9 @@ class TensorBoard(Logger):
     def hyperparameters(self, values: Mapping[str, Any], tags: Sequence[str]) -> None:
         """See `Logger.hyperparameters`; TensorBoard shows them on its page HParams.
 
-        A run that goes on has them already: those that can be told apart by them have not changed.
+        A run that goes on keeps those that it began with, for they can't be taken out of its files.
         """
-        if self._goes_on:
+        if self._has_hyperparameters:
             return
         # The third would say that the run has ended.
         about, begun, _ = hparams(flat(values), dict.fromkeys(tags, 0.0))

@@ -42,6 +42,10 @@ class RunPosition:
     lesson_count: int = 1
 
 
+SINCE_SUMMARY, LATEST = "since_summary", "latest_summary"
+"""Parts of the saved state: what the next summary is the mean of, and what the last one told."""
+
+
 class Summary:
     """Gathers statistics, and reports them every `summary_freq` steps.
 
@@ -80,6 +84,20 @@ class Summary:
         self._summary_step = start_step
         self._checkpoint: str | None = None
         self._evaluation: dict[str, Any] | None = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a run that is resumed goes on with: parts of its saved state."""
+        latest = Averager()
+        latest.add({tag: self._last[tag] for tag in (REWARD_TAG, SUCCESS_TAG) if tag in self._last})
+        return {SINCE_SUMMARY: self._averager.state_dict(), LATEST: latest.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on with it; former versions saved none."""
+        if SINCE_SUMMARY in state:
+            self._averager.load_state_dict(state[SINCE_SUMMARY])
+            latest = Averager()
+            latest.load_state_dict(state[LATEST])
+            self._last = latest.means()
 
     @property
     def compared_tags(self) -> tuple[str, ...]:

@@ -879,4 +879,4 @@ def test_workers_are_all_the_threads_there_are(make: MakeEnv) -> None:
     env = make(64, simulator="fast", workers=1)
     env.reset(seed=0)
     env.step(np.zeros((64, 4), np.float32))
-    assert threading.active_count() == before
+    assert threading.active_count() <= before

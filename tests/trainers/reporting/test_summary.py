@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -115,6 +116,27 @@ def test_summaries_come_at_multiples_of_their_frequency(make_session: MakeSessio
     for step in range(352, 480, 32):
         report(resumed, session, step)
     assert list(log2.points) == [416]  # as if it had never stopped
+
+
+def test_a_resumed_run_goes_on_with_what_it_had_gathered(make_session: MakeSession) -> None:
+    log, session = Log(), make_session()
+    before = summary_of(log, session)
+    before.add_episodes(episodes([1.0, 3.0], success=[0, 1]))
+    report(before, session, 100)
+    before.add_episodes(episodes([4.0], success=[0]))
+    before.add({"Losses/Value Loss": math.inf, "Losses/Policy Loss": 0.5})
+    state = before.state_dict()
+    after = summary_of(log2 := Log(), session, start_step=150)
+    after.load_state_dict(state)
+    after.status(session.position, "running")
+    assert (log2.statuses[-1]["reward"], log2.statuses[-1]["success"]) == (2.0, 0.5)
+    after.add_episodes(episodes([5.0, 6.0], success=[1, 1]))
+    after.add({"Losses/Policy Loss": 1.5})
+    report(after, session, 200)
+    assert log2.points[200]["Environment/Cumulative Reward"] == 5.0
+    assert log2.points[200]["Losses/Policy Loss"] == 1.0
+    assert "Losses/Value Loss" not in log2.points[200]  # a checkpoint has no infinite means
+    summary_of(Log(), session).load_state_dict({})  # of a former version
 
 
 def test_a_summary_starts_anew_and_the_status_remembers(make_session: MakeSession) -> None:
