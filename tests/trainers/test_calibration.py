@@ -70,7 +70,7 @@ def test_a_policy_knows_when_it_hits(
     assert calibrate(results) == DONE
     said = capfd.readouterr().out
     assert "right is at most: distance 70.00 cm" in said
-    assert "  elsewhere: sure 0 of 50\n" in said
+    assert "  elsewhere: sure 0 of 100\n" in said
     assert "  one throw: " in said
     assert "  no throw: " not in said
     assert "no throw: left out, for it can't be had here: nobody may throw" in caplog.text

@@ -61,7 +61,7 @@ LEAST_EPISODES = 100
 SHARES = (0.55, 0.30)
 """Of the episodes: to fit in, and to choose the threshold in; the rest is to measure in."""
 AS_TRAINED = "as trained"
-EPISODES_PER_UNANSWERABLE = 40
+EPISODES_PER_UNANSWERABLE = 20
 """There is one observation of each kind that can't be answered for so many episodes."""
 EPISODES_PER_HARDER = 20
 """There is one episode of each harder task for so many of the ordinary."""
