@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 
 from rich.progress import track
 from rich.table import Table
@@ -11,9 +12,10 @@ from benchmarks.command import missing
 from benchmarks.speed.figures import MODES, Figures, growth, speedup
 from benchmarks.speed.limits import table_of_limits
 from benchmarks.speed.processes import peak_mib, start_s
+from benchmarks.speed.ranks import OfRanks
 from benchmarks.speed.runs import table_of_runs
 from benchmarks.speed.simulation import FRAMES, frames, steps
-from benchmarks.speed.training import PEER_PACKAGES, contenders, training
+from benchmarks.speed.training import PEER_PACKAGES, Ventosa, contenders, training
 from benchmarks.tables import table
 
 
@@ -42,7 +44,8 @@ def train(options: argparse.Namespace) -> Table:
     """Steps per second of the training loops."""
     found: Figures = {}
     sizes: dict[str, int] = {}
-    makers = contenders(not missing(*PEER_PACKAGES), options.ranks)
+    ours = Ventosa if options.ranks == 1 else partial(OfRanks, options.ranks)
+    makers = contenders(not missing(*PEER_PACKAGES), ours)
     for size in track(options.sizes, "training", transient=True):
         for mode in MODES:
             figures, sizes[_image(size)] = training(

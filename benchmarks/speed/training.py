@@ -59,7 +59,8 @@ class Contender(Protocol):
         """Ends the environments."""
 
 
-Makers = Mapping[str, Callable[[RunSettings], Contender]]
+Maker = Callable[[RunSettings], Contender]
+Makers = Mapping[str, Maker]
 
 
 def load(size: int, mode: str, num_envs: int) -> RunSettings:
@@ -114,13 +115,8 @@ class _NoCheckpoints(Checkpoints):
         return Path()
 
 
-def contenders(peer: bool, ranks: int = 1) -> Makers:
-    """What is compared: this project's trainer, on so many processes, and its peer if asked for."""
-    ours: Callable[[RunSettings], Contender] = Ventosa
-    if ranks > 1:
-        from benchmarks.speed.ranks import OfRanks  # noqa: PLC0415
-
-        ours = partial(OfRanks, ranks)
+def contenders(peer: bool, ours: Maker = Ventosa) -> Makers:
+    """What is compared: this project's trainer, and its peer if asked for."""
     if not peer:
         return {OURS: ours}
     # Imported late, for it needs the extra `bench`.

@@ -112,6 +112,7 @@ def test_a_run_is_trained_then_evaluated(tmp_path: Path) -> None:
     assert "c=2" in evaluate
 
 
+@pytest.mark.soak
 def test_told_to_stop_it_stops_its_runs(tmp_path: Path) -> None:
     run = tmp_path / "runs" / "run-none-1000000-0"
     command = ["--changes", "none", "--seeds", "0", "--steps", "1000000", "--results", tmp_path]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import time
+from functools import partial
 
 import pytest
 
@@ -58,7 +59,7 @@ def test_training_beside_its_peer() -> None:
 
 
 def test_training_of_ranks() -> None:
-    makers = training.contenders(peer=False, ranks=2)
+    makers = training.contenders(peer=False, ours=partial(ranks.OfRanks, 2))
     found, parameters = training.training("frame grab", 32, 16, 2, 0.001, makers)
     collection, update, whole = (by["ventosa"].values for by in found.values())
     assert all(both < min(each) for *each, both in zip(collection, update, whole, strict=True))
