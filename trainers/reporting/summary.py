@@ -93,11 +93,11 @@ class Summary:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Goes on with it; former versions saved none."""
-        if SINCE_SUMMARY in state:
-            self._averager.load_state_dict(state[SINCE_SUMMARY])
-            latest = Averager()
-            latest.load_state_dict(state[LATEST])
-            self._last = latest.means()
+        latest = Averager()
+        for name, averager in ((SINCE_SUMMARY, self._averager), (LATEST, latest)):
+            if name in state:
+                averager.load_state_dict(state[name])
+        self._last = latest.means()
 
     @property
     def compared_tags(self) -> tuple[str, ...]:

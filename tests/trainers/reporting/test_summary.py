@@ -136,6 +136,8 @@ def test_a_resumed_run_goes_on_with_what_it_had_gathered(make_session: MakeSessi
     assert log2.points[200]["Environment/Cumulative Reward"] == 5.0
     assert log2.points[200]["Losses/Policy Loss"] == 1.0
     assert "Losses/Value Loss" not in log2.points[200]  # a checkpoint has no infinite means
+    for name in state:
+        summary_of(Log(), session).load_state_dict({name: state[name]})
     summary_of(Log(), session).load_state_dict({})  # of a former version
 
 
