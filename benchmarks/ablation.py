@@ -20,13 +20,12 @@ from typing import Any
 import yaml
 from rich.console import Console
 
-from benchmarks.command import ROOT, add_options
+from benchmarks.command import ROOT, add_options, run_unless_stopped
 from benchmarks.tables import table, write_between
 from trainers.common.command import tells_failures
 from trainers.common.errors import UserError
-from trainers.comparison.jobs import Job, run_missing
+from trainers.comparison.jobs import Job
 from trainers.comparison.tables import markdown
-from trainers.learn import stop_on_signals
 
 RUN_FILES = ROOT / "config"
 CHANGES_FILE = Path(__file__).with_suffix(".yaml")
@@ -92,11 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for seed in options.seeds
         for change in changes
     }
-    with stop_on_signals() as stop:
-        code = run_missing(list(jobs.values()), options.jobs, stop.requested)
-    if stop.requested():
-        return stop.exit_code
-    if code:
+    if code := run_unless_stopped(list(jobs.values()), options.jobs):
         return code
     reports = {key: json.loads(job.results.read_text()) for key, job in jobs.items()}
     rows = [

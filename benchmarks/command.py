@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-from trainers.comparison.jobs import CORES
+from trainers.comparison.jobs import CORES, Job, run_missing
+from trainers.learn import stop_on_signals
 
 ROOT = Path(__file__).parents[1]
 EXTRA = "bench"
@@ -19,6 +21,13 @@ def torchrun(count: int, *command: str) -> list[str]:
     launch = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", str(count)]
     rendezvous = ["--rdzv-backend", "c10d", "--rdzv-endpoint", "localhost:0"]
     return [*launch, *rendezvous, "-m", *command]
+
+
+def run_unless_stopped(jobs: Sequence[Job], at_once: int) -> int:
+    """Does the jobs that are missing; returns the exit code, by the signal where one came."""
+    with stop_on_signals() as stop:
+        code = run_missing(jobs, at_once, stop.requested)
+    return stop.exit_code if stop.requested() else code
 
 
 def missing(*packages: str) -> list[str]:

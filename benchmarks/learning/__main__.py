@@ -15,15 +15,14 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.command import EXTRA, ROOT, add_options
+from benchmarks.command import EXTRA, ROOT, add_options, run_unless_stopped
 from benchmarks.learning.cases import CASES, PLUGINS, SIDES, Entry
 from benchmarks.learning.report import HEAD, draw, rows
 from benchmarks.tables import table, write_between
 from trainers.common.command import require_extra, tells_failures
 from trainers.common.errors import UserError
-from trainers.comparison.jobs import Job, run_missing
+from trainers.comparison.jobs import Job
 from trainers.comparison.tables import markdown
-from trainers.learn import stop_on_signals
 from trainers.runfile.registry import load_registries
 
 
@@ -43,11 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ]
     if not all(job.results.exists() for job in jobs):
         require_extra(EXTRA, "stable_baselines3", "sb3_contrib", "mujoco")
-    with stop_on_signals() as stop:
-        code = run_missing(jobs, options.jobs, stop.requested)
-    if stop.requested():
-        return stop.exit_code
-    return code or report(options, jobs)
+    return run_unless_stopped(jobs, options.jobs) or report(options, jobs)
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
