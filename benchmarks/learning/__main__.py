@@ -3,7 +3,8 @@
 `python -m benchmarks.learning` trains PPO, TRPO, DDPG and SAC and their counterparts of
 Stable-Baselines3 and sb3-contrib with the hyper-parameters of our run files, several seeds each,
 and evaluates both in the same way. Each run leaves a file of results, and what is there is not
-trained again. Needs the extra `bench`; SAC is a plugin, and left out where it is not installed.
+trained again; `--long` does the same with as many steps as MuJoCo's tasks usually get. Needs the
+extra `bench`; SAC is a plugin, and left out where it is not installed.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.command import EXTRA, ROOT, add_options, run_unless_stopped
-from benchmarks.learning.cases import CASES, PLUGINS, SIDES, Entry
+from benchmarks.learning.cases import CASES, LONG_CASES, PLUGINS, SIDES, Entry
 from benchmarks.learning.report import HEAD, draw, rows
 from benchmarks.tables import table, write_between
 from trainers.common.command import require_extra, tells_failures
@@ -35,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Side by side with its peer, so that both meet the same moods of the machine.
     jobs = [
         _job(Entry(case, side, seed), options.results)
-        for case in CASES
+        for case in (LONG_CASES if options.long else CASES)
         if case.algorithm in algorithms and case.task in options.tasks
         for seed in options.seeds or range(case.seeds)
         for side in SIDES
@@ -47,14 +48,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Reads the command line."""
-    algorithms = sorted({case.algorithm for case in CASES})
-    tasks = sorted({case.task for case in CASES})
+    algorithms = sorted({case.algorithm for case in CASES + LONG_CASES})
+    tasks = sorted({case.task for case in CASES + LONG_CASES})
     parser = argparse.ArgumentParser(prog="python -m benchmarks.learning", description=__doc__)
     parser.add_argument(
         "--algorithms", nargs="+", choices=algorithms, help="default: all there are"
     )
     parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks)
     parser.add_argument("--seeds", nargs="+", type=int, help="instead of each case's own")
+    parser.add_argument("--long", action="store_true", help="up to a million steps each")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="draw the learning curves")
     add_options(parser, "results/learning")
     return parser.parse_args(arguments)
@@ -78,14 +80,14 @@ def trainable(asked: Sequence[str] | None) -> set[str]:
 def report(options: argparse.Namespace, jobs: Sequence[Job]) -> int:
     """Prints the table, and writes page and pictures where asked."""
     results = [json.loads(job.results.read_text()) for job in jobs]
-    found = rows(results)
+    found, name = rows(results), "learning_long" if options.long else "learning"
     title = "mean final return (95 % confidence) and steps/s while training"
     Console().print(table(title, HEAD, found))
     if options.pictures is not None:
         options.pictures.mkdir(parents=True, exist_ok=True)
-        draw(results, options.pictures)
+        draw(results, options.pictures, name)
     if options.page is not None:
-        write_between(options.page, "learning", markdown(HEAD, found))
+        write_between(options.page, name.replace("_", " "), markdown(HEAD, found))
     return 0
 
 

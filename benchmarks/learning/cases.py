@@ -59,6 +59,15 @@ CASES = (
     Case("sac", "pendulum", 20_000, seeds=3),
     Case("sac", "hopper", 100_000, seeds=3),
 )
+LONG_CASES = (
+    Case("ppo", "half_cheetah", 1_000_000, seeds=3),
+    Case("ppo", "hopper", 1_000_000, seeds=3),
+    Case("ppo", "walker2d", 300_000, seeds=5),
+    Case("trpo", "half_cheetah", 1_000_000, seeds=3),
+    Case("trpo", "hopper", 1_000_000, seeds=3),
+    Case("trpo", "walker2d", 300_000, seeds=5),
+)
+"""As long as these tasks are usually trained, with fewer seeds."""
 
 
 @dataclass(frozen=True)

@@ -56,8 +56,8 @@ def half_interval(values: Sequence[float]) -> float:
     return float(factor) * statistics.stdev(values) / math.sqrt(len(values))
 
 
-def draw(results: Sequence[Result], folder: Path) -> None:
-    """Draws one picture of learning curves for each algorithm."""
+def draw(results: Sequence[Result], folder: Path, stem: str) -> None:
+    """Draws one picture of learning curves for each algorithm, `stem_algorithm.png`."""
     from matplotlib.figure import Figure  # noqa: PLC0415  # of the extra `bench`
 
     cases = _by_case(results)
@@ -73,7 +73,7 @@ def draw(results: Sequence[Result], folder: Path) -> None:
             axis.spines[["top", "right"]].set_visible(False)
         axes[0].set_ylabel("return of the deterministic policy")
         axes[0].legend(frameon=False)
-        figure.savefig(folder / f"learning_{algorithm}.png", dpi=110)
+        figure.savefig(folder / f"{stem}_{algorithm}.png", dpi=110)
 
 
 def _draw_band(axis: Any, runs: Sequence[Result], steps: int, label: str, color: str) -> None:

@@ -15,7 +15,15 @@ import pytest
 from gymnasium.spaces import Box, Dict
 
 from benchmarks.command import ROOT
-from benchmarks.learning.cases import CASES, PEER_NAMES, PLUGINS, RUN_FILES, Case, Entry
+from benchmarks.learning.cases import (
+    CASES,
+    LONG_CASES,
+    PEER_NAMES,
+    PLUGINS,
+    RUN_FILES,
+    Case,
+    Entry,
+)
 from benchmarks.learning.evaluation import Referee, returns
 from envs.environment import Environment
 from trainers.networks.network import NetworkSettings
@@ -111,7 +119,7 @@ def test_a_row_has_means_and_median_speeds_of_both_sides() -> None:
     assert len(HEAD) == len(row)
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", CASES + LONG_CASES, ids=lambda case: f"{case.name}-{case.steps}")
 def test_every_case_has_a_run_file_and_a_peer(case: Case) -> None:
     plugin = PLUGINS.get(case.algorithm)
     if plugin is None:
@@ -169,6 +177,27 @@ def test_the_command_reports_on_what_is_there(
     assert "| pendulum | 1,000 | ppo | 3 | -160 ± 25 | -170 ± 25 | 333 | 333 |" in text
     assert text.endswith("<!-- end of learning -->\nafter\n")
     assert (tmp_path / "new" / "learning_ppo.png").stat().st_size > 1000
+
+
+def test_long_cases_have_a_table_of_their_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "<!-- learning -->\nold\n<!-- end of learning -->\n"
+        "<!-- learning long -->\nold\n<!-- end of learning long -->\n"
+    )
+    for one in RESULTS:
+        case = {"algorithm": "trpo", "task": "walker2d", "steps": 300_000}
+        file = tmp_path / f"walker2d_trpo-300000-{one['side']}-{one['seed']}.json"
+        file.write_text(json.dumps(one | {"case": case}))
+    chosen = ["--long", "--algorithms", "trpo", "--tasks", "walker2d", "--seeds", "0", "1", "2"]
+    written = ["--results", str(tmp_path), "--page", str(page), "--pictures", str(tmp_path)]
+    assert learning.main([*chosen, *written]) == 0
+    text = page.read_text()
+    assert text.startswith("<!-- learning -->\nold\n<!-- end of learning -->\n")
+    assert "| walker2d | 300,000 | trpo | 3 | -160 ± 25 |" in text
+    assert (tmp_path / "learning_long_trpo.png").exists()
 
 
 def test_the_peer_of_a_plugin_is_found_by_its_name_and_takes_its_settings() -> None:
