@@ -20,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse_options(arguments)
     require_extra("render", "matplotlib")
     # Imported late, so that `--help` answers at once.
-    from trainers.comparison.planning import collect, plan  # noqa: PLC0415
+    from trainers.comparison.planning import collect, jobs_of, plan  # noqa: PLC0415
     from trainers.comparison.report import write_report  # noqa: PLC0415
     from trainers.runfile.registry import load_registries  # noqa: PLC0415
     from trainers.saving.run_folder import CONFIGURATION  # noqa: PLC0415
@@ -29,14 +29,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     planned = list(plan(options, [path for path in options.paths if path not in made]))
     registries = load_registries()
     # All run files are looked at before the first run begins.
-    jobs = [run.job(registries) for run in planned]
+    jobs = jobs_of(planned, registries)
     with stop_on_signals() as stop:
         try:
             code = run_missing(jobs, options.jobs, stop.requested)
-            page = write_report(collect(planned, made), options.report or options.results_dir)
+            experiments = collect(planned, made)
+            page = write_report(experiments, options.report or options.results_dir)
         except OSError as error:
             raise UserError(f"{error.filename}: can't be written: {error.strerror}") from error
     print(page)
+    for run in (run for runs in experiments.values() for run in runs if run.is_unreadable):
+        print(run.status["reason"], file=sys.stderr)
+        code = FAILED
     if stop.requested():
         return stop.exit_code
     return FAILED if code else DONE

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
-from trainers.common.command import DONE, MISTAKE
+from trainers.common.command import DONE, FAILED, MISTAKE
 from trainers.compare import main, parse_options
 from trainers.comparison.planning import PlannedRun, plan
 from trainers.runfile.registry import load_registries
@@ -63,6 +63,40 @@ def test_runs_what_is_missing_and_reports_on_all(
     assert "begins" not in capfd.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in results.rglob("*")} == before
     assert "| pole | 3 | 128 |" in (folder / "report.md").read_text()
+
+
+def test_what_is_damaged_or_missing_is_told_of_beside_the_others(
+    config: Path, tmp_path: Path, learn: Callable[..., Any], capfd: pytest.CaptureFixture[str]
+) -> None:
+    results = tmp_path / "runs"
+    for seed in (0, 1):
+        learn(config, f"seed={seed}", "--run-id", f"pole-{seed}", results_dir=results)
+    status = results / "pole-1" / "status.json"
+    status.write_text(status.read_text()[:40])
+    damaged = status.read_bytes()
+    shutil.copytree(results / "pole-0", tmp_path / "theirs")
+    (tmp_path / "theirs" / CONFIGURATION).write_text("{")
+    words = [str(config), "--seeds", "2", "--results-dir", str(results), str(tmp_path / "theirs")]
+    assert main(words) == FAILED
+    assert f"{status}: can't be read" in capfd.readouterr().err
+    page = (results / "report.md").read_text()
+    assert f"finished, unreadable: {status}: can't be read" in page
+    assert f"| theirs | 1 | 0 |  |  |  |  | 0.00 | unreadable: {tmp_path / 'theirs'}" in page
+    assert status.read_bytes() == damaged
+
+
+def test_runs_of_one_seed_are_not_one_experiment(
+    config: Path, tmp_path: Path, learn: Callable[..., Any]
+) -> None:
+    """Nor is a run file that is named twice two."""
+    learn(config, "--run-id", "one", results_dir=tmp_path)
+    shutil.copytree(tmp_path / "one", tmp_path / "two")
+    assert main([str(tmp_path / "one"), str(tmp_path / "two"), "--report", str(tmp_path)]) == DONE
+    page = (tmp_path / "report.md").read_text()
+    assert "| one | 1 |" in page
+    assert "| two | 1 |" in page
+    twice = parse_options([str(config), str(config.parent), "--seeds", "1"])
+    assert len(list(plan(twice, twice.paths))) == 1
 
 
 def test_each_seed_and_number_of_steps_has_a_run_of_its_own(config: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 from trainers.common.errors import UserError
 from trainers.comparison.jobs import Job
 from trainers.comparison.report import Experiments
-from trainers.comparison.results import RunResult, read_run, read_status
+from trainers.comparison.results import RunResult, read_status, read_what_is_left
 from trainers.runfile.changes import differences
 from trainers.runfile.registry import Registries
 from trainers.runfile.settings import dump_yaml, load_run
@@ -69,7 +69,7 @@ def plan(options: argparse.Namespace, paths: Sequence[Path]) -> Iterator[Planned
     configs: dict[str, Path] = {}
     for config in _run_files(paths):
         earlier = configs.setdefault(config.stem, config)
-        if earlier is not config:
+        if earlier.resolve() != config.resolve():
             raise UserError(f"{earlier} and {config} have the same name: rename one of them")
     steps = options.max_steps
     overrides = [] if steps is None else [f"trainer.max_steps={steps}"]
@@ -91,27 +91,48 @@ def _run_files(paths: Sequence[Path]) -> Iterator[Path]:
         yield from files
 
 
+def jobs_of(planned: Sequence[PlannedRun], registries: Registries) -> list[Job]:
+    """What is left to do; what is damaged is left alone, and the report says so.
+
+    Raises:
+        UserError: a run file is wrong, or what is there was made by another one.
+    """
+    return [run.job(registries) for run in planned if _is_readable(run.folder)]
+
+
+def _is_readable(folder: Path) -> bool:
+    if not (folder / CONFIGURATION).is_file():
+        return True
+    try:
+        read(folder / CONFIGURATION)
+        read_status(folder)
+    except UserError:
+        return False
+    return True
+
+
 def collect(planned: Sequence[PlannedRun], made: Sequence[Path]) -> Experiments:
     """What there is of the runs by experiment; of those made elsewhere by their configuration.
 
     Raises:
-        UserError: a run's files can't be read, or there is nothing at all.
+        UserError: there is nothing at all.
     """
     experiments: dict[str, list[RunResult]] = {}
     for run in planned:
-        if (run.folder / CONFIGURATION).is_file():
-            experiments.setdefault(run.experiment, []).append(read_run(run.folder))
-    for result in map(read_run, made):
+        experiments.setdefault(run.experiment, []).append(read_what_is_left(run.folder))
+    for result in map(read_what_is_left, made):
         experiments.setdefault(_name_of(result, experiments), []).append(result)
-    if not experiments:
+    if not any(run.configuration for runs in experiments.values() for run in runs):
         raise UserError("there is nothing to report on: no run has begun")
     return experiments
 
 
 def _name_of(result: RunResult, known: Mapping[str, Sequence[RunResult]]) -> str:
-    """The experiment that a run belongs to: that of a run which differs in its seed alone."""
+    """The experiment that a run belongs to: that of runs which differ in their seeds alone."""
     for name, runs in known.items():
-        if _but_seed(runs[0]) == _but_seed(result):
+        begun = [run for run in runs if run.configuration]
+        alike = begun and all(_but_seed(run) == _but_seed(result) for run in begun)
+        if alike and result.seed not in (run.seed for run in begun):
             return name
     name = re.sub(rf"[-_]?(seed|s)?{result.seed}$", "", result.folder.name) or result.folder.name
     return name if name not in known else result.folder.name

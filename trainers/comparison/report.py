@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ HEAD = (
     "steps",
     "final reward",
     "best reward",
-    "success",
+    "success in training",
     "lesson",
     "hours",
     "ended",
@@ -53,7 +53,10 @@ def lines(experiments: Experiments) -> Iterator[str]:
     """The page."""
     yield "# Runs side by side"
     yield ""
-    yield "Medians over the seeds, the lowest and the highest in brackets."
+    yield (
+        "Medians over the seeds, the lowest and the highest in brackets. Success in training is of "
+        "actions as they are drawn, by the limits of the lesson that was reached."
+    )
     yield ""
     yield from markdown(HEAD, [row(name, runs) for name, runs in experiments.items()])
     yield ""
@@ -62,11 +65,13 @@ def lines(experiments: Experiments) -> Iterator[str]:
         yield ""
         yield "## Held-out evaluation"
         yield ""
+        yield "The last one of each run, in episodes that training does not draw."
+        yield ""
         yield from markdown(
-            ["figure", *experiments],
+            ["experiment", *names.values()],
             [
-                [name, *(_of_evaluation(runs, name) for runs in experiments.values())]
-                for name in names
+                [experiment, *(_of_evaluation(runs, key) for key in names)]
+                for experiment, runs in experiments.items()
             ],
         )
 
@@ -77,9 +82,9 @@ def row(name: str, runs: Sequence[RunResult]) -> list[str]:
         name,
         str(len(runs)),
         f"{statistics.median(run.step for run in runs):,.0f}",
-        spread(_values(runs, lambda run: run.reward[1][-1])),
-        spread(_values(runs, lambda run: run.reward[1].max())),
-        spread([100.0 * value for value in _values(runs, _success)], " %"),
+        spread([run.reward[1][-1] for run in runs if len(run.reward[1])]),
+        spread([run.reward[1].max() for run in runs if len(run.reward[1])]),
+        spread([100.0 * value for run in runs if (value := _success(run)) is not None], " %"),
         _lessons(runs),
         f"{statistics.median(run.seconds for run in runs) / 3600.0:.2f}",
         ", ".join(dict.fromkeys(_ended(run) for run in runs)),
@@ -109,8 +114,9 @@ def draw(experiments: Experiments, files: Sequence[Path]) -> None:
         axis.set_title(name)
         axis.spines[["top", "right"]].set_visible(False)
         if len(steps):
-            axis.fill_between(steps, curves.min(0), curves.max(0), alpha=0.25, linewidth=0)
-            axis.plot(steps, np.median(curves, axis=0), linewidth=2.0)
+            lowest, highest = np.nanmin(curves, axis=0), np.nanmax(curves, axis=0)
+            axis.fill_between(steps, lowest, highest, alpha=0.25, linewidth=0)
+            axis.plot(steps, np.nanmedian(curves, axis=0), linewidth=2.0)
     for axis in axes[len(experiments) :]:
         axis.set_axis_off()
     figure.supxlabel("steps")
@@ -120,27 +126,22 @@ def draw(experiments: Experiments, files: Sequence[Path]) -> None:
 
 
 def common_curves(curves: Sequence[Curve]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Curves at the same steps (k,): values (n, k), up to where the shortest one ends."""
+    """Curves at the same steps (k,): values (n, k), NaN where one has none."""
     drawn = [curve for curve in curves if len(curve[0])]
     if not drawn:
         return np.empty(0), np.empty((0, 0))
-    first, last = max(c[0][0] for c in drawn), min(c[0][-1] for c in drawn)
-    steps = np.linspace(first, max(first, last), POINTS)
-    return steps, np.stack([np.interp(steps, at, values) for at, values in drawn])
-
-
-def _values(runs: Sequence[RunResult], value: Callable[[RunResult], float | None]) -> list[float]:
-    """One for each run that has any reward, and that value."""
-    found = [value(run) for run in runs if len(run.reward[0])]
-    return [float(number) for number in found if number is not None]
+    first, last = min(c[0][0] for c in drawn), max(c[0][-1] for c in drawn)
+    steps = np.linspace(first, last, POINTS)
+    found = np.stack(
+        [np.interp(steps, at, values, left=np.nan, right=np.nan) for at, values in drawn]
+    )
+    is_any = np.isfinite(found).any(axis=0)
+    return steps[is_any], found[:, is_any]
 
 
 def _success(run: RunResult) -> float | None:
-    """Of the held-out evaluation if there was one, of training otherwise."""
-    evaluated = run.evaluation
-    return evaluated.get(
-        "first_action_success", evaluated.get("success", run.status.get("success"))
-    )
+    value: float | None = run.status.get("success")
+    return value
 
 
 def _lessons(runs: Sequence[RunResult]) -> str:
@@ -150,22 +151,33 @@ def _lessons(runs: Sequence[RunResult]) -> str:
 
 
 def _ended(run: RunResult) -> str:
-    state, reason = run.status.get("state", "never begun"), run.status.get("reason", "")
-    return state if state == "finished" or not reason else f"{state}: {reason}"
+    state, reason = run.status.get("state", "unknown"), run.status.get("reason", "")
+    told = state if state == "finished" or not reason else f"{state}: {reason}"
+    return told if run.cut_at is None else f"{told} (its curves end at step {run.cut_at:,})"
 
 
-def _figure_names(experiments: Experiments) -> list[str]:
-    names: dict[str, None] = {}
+def _figure_names(experiments: Experiments) -> dict[str, str]:
+    """Heads of the columns by the keys of evaluations: `error_m median / p95`."""
+    names: dict[str, str] = {}
     for runs in experiments.values():
         for run in runs:
-            names |= dict.fromkeys(_evaluated(run))
-    return list(names)
+            for key, parts in _evaluated(run).items():
+                names.setdefault(key, f"{key} {' / '.join(parts)}".strip())
+    return names
 
 
-def _evaluated(run: RunResult) -> dict[str, float]:
-    found = figure_values(run.evaluation)
-    return {" ".join(filter(None, (key, part))): value for key, part, value in found}
+def _evaluated(run: RunResult) -> dict[str, dict[str, float]]:
+    """Values by key and part, which is empty where the entry is one number."""
+    found: dict[str, dict[str, float]] = {}
+    for key, part, value in figure_values(run.evaluation):
+        found.setdefault(key, {})[part] = value
+    return found
 
 
-def _of_evaluation(runs: Sequence[RunResult], name: str) -> str:
-    return spread([value[name] for run in runs if name in (value := _evaluated(run))])
+def _of_evaluation(runs: Sequence[RunResult], key: str) -> str:
+    found = [value[key] for run in runs if key in (value := _evaluated(run))]
+    parts = dict.fromkeys(part for value in found for part in value)
+    values = {part: [value[part] for value in found if part in value] for part in parts}
+    if "" in values:
+        return spread(values[""])
+    return " / ".join(f"{statistics.median(numbers):.3g}" for numbers in values.values())

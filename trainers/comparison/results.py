@@ -17,7 +17,7 @@ from trainers.runfile.yaml_document import read, shown
 from trainers.saving.run_folder import CONFIGURATION
 from trainers.saving.run_lock import is_held
 
-STATUS = "status.json"
+STATUS, UNREADABLE = "status.json", "unreadable"
 REWARD, SPEED = "Environment/Cumulative Reward", "Performance/Steps Per Second"
 Curve = tuple[NDArray[np.int64], NDArray[np.float64]]
 """Steps (k,) that rise, and values (k,)."""
@@ -78,6 +78,21 @@ class RunResult:
         return self.curves.get(REWARD, NOTHING)
 
     @property
+    def is_unreadable(self) -> bool:
+        """Whether its files are damaged; the status has the reason."""
+        return self.status.get("state") == UNREADABLE
+
+    @property
+    def cut_at(self) -> int | None:
+        """The step that its curves end at, where the run itself came farther; None: they are whole.
+
+        Event files that were cut short, or are missing, tell less than `status.json` does.
+        """
+        steps = np.unique(np.concatenate([NOTHING[0], *(c[0] for c in self.curves.values())]))
+        last, gap = (int(steps[-1]), np.diff(steps, prepend=0).max()) if len(steps) else (0, 0)
+        return last if self.step - last > 2 * gap else None
+
+    @property
     def seconds(self) -> float:
         """What all steps took, pauses between them left out."""
         steps, rates = self.curves.get(SPEED, NOTHING)
@@ -101,6 +116,16 @@ def read_run(folder: Path) -> RunResult:
     return RunResult(
         folder, configuration, read_status(folder), {tag: curves.curve(tag) for tag in curves.tags}
     )
+
+
+def read_what_is_left(folder: Path) -> RunResult:
+    """The same of a folder that may be damaged or missing, which its state then tells of."""
+    if not (folder / CONFIGURATION).is_file():
+        return RunResult(folder, {}, {"state": "never begun"})
+    try:
+        return read_run(folder)
+    except UserError as error:
+        return RunResult(folder, {}, {"state": UNREADABLE, "reason": str(error)})
 
 
 def read_status(folder: Path) -> dict[str, Any]:
