@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import json
+import random
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +38,8 @@ from trainers.runfile.yaml_document import (
 Value = bool | int | float | str | None
 """Of a setting that is tried."""
 TRIALS = 20
+OTHERS_TRIED = 16
+"""Draws of the other keys' values, where a value does not go with those of the base."""
 
 
 class Range(BaseModel, frozen=True, extra="forbid"):
@@ -188,7 +192,7 @@ class Sweep:
 
 
 def load_sweep(path: Path, registries: Registries) -> Sweep:
-    """Reads a sweep file, and tries every key and the ends of every range on the settings.
+    """Reads a sweep file, and tries its keys and values on the settings.
 
     Raises:
         SettingsError: with everything that is wrong, where it stands, and what is allowed.
@@ -206,11 +210,15 @@ def load_sweep(path: Path, registries: Registries) -> Sweep:
     if run.evaluation is None:
         message = "missing: trials are judged by it; write it there, or here under `fixed`"
         raise SettingsError([Problem(str(base), ("evaluation",), message)])
-    trying = _Trying(common, document, registries)
-    whole = {key for key, axis in settings.space.items() if trying.is_whole(key, axis)}
+    trying = _Trying(settings.space, common, document, registries)
+    whole = frozenset(key for key in settings.space if trying.is_whole(key))
+    sweep = Sweep(path, settings, base, run, whole)
+    if settings.sampler == "grid" and not trying.problems:
+        for values in sweep.cells[: sweep.count(None)]:
+            trying.try_cell(values)
     if trying.problems:
         raise SettingsError(trying.problems)
-    return Sweep(path, settings, base, run, frozenset(whole))
+    return sweep
 
 
 def _settings(document: Document) -> SweepSettings:
@@ -236,42 +244,78 @@ def _not_in_a_grid(settings: SweepSettings) -> list[tuple[KeyPath, str]]:
 
 
 class _Trying:
-    """Tries values of one setting at a time, the others as the base has them.
+    """Tries values on the settings, each with some of the others.
 
     Attributes:
         problems: what is wrong, at the sweep file's lines.
     """
 
-    def __init__(self, common: Document, sweep_file: Document, registries: Registries):
-        self._common, self._sweep_file, self._registries = common, sweep_file, registries
+    def __init__(
+        self,
+        space: Mapping[str, Range],
+        common: Document,
+        sweep_file: Document,
+        registries: Registries,
+    ):
+        self._space, self._common, self._sweep_file = space, common, sweep_file
+        self._registries, self._random = registries, random.Random(0)
         self.problems: list[Problem] = []
 
-    def is_whole(self, key: str, axis: Range) -> bool:
-        """Whether a range is of whole numbers, as the settings read its ends."""
-        found = [self._read(key, value) for value in axis.outermost]
+    def is_whole(self, key: str) -> bool:
+        """Whether a range is of whole numbers, as the settings read its ends.
+
+        What they refuse is a problem, unless they take it with other values of other keys.
+        """
+        axis = self._space[key]
+        found = [self._accepted(key, value) for value in axis.outermost]
         return axis.choice is None and all(isinstance(value, int) for value in found)
 
-    def _read(self, key: str, value: Value) -> Any:
-        """A value as the settings read it; None where they refuse it."""
-        trial = deepcopy(self._common)
+    def try_cell(self, values: Mapping[str, Value]) -> None:
+        """Tries all values of a grid's cell together."""
         try:
-            trial.set(key, value, "")
-            found: Any = resolved(load_run_document(trial, [], self._registries))
-            for step in key.split("."):
-                found = found[int(step) if isinstance(found, list) else step]
-            return found
+            self._run(values)
         except SettingsError as error:
+            said = ", ".join(f"{key} {shown(value)}" for key, value in values.items())
             for problem in error.problems:
-                about_others = f"with {shown(value)}, {dotted(problem.path)}: "
-                self._refuse(
-                    key, "" if dotted(problem.path) == key else about_others, problem.message
-                )
-        except KeyError:
-            self._refuse(key, "", "has another name now, or is no setting any more")
+                self._refuse(("space",), f"{said}: {dotted(problem.path)}: ", problem.message)
+
+    def _accepted(self, key: str, value: Value) -> Any:
+        """A value as the settings read it; None where they refuse it."""
+        try:
+            return self._read(key, {key: value})
+        except SettingsError as error:
+            for _ in range(OTHERS_TRIED):
+                others = {k: self._random.choice(axis.outermost) for k, axis in self._space.items()}
+                with suppress(SettingsError):
+                    return self._read(key, {**others, key: value})
+            for problem in error.problems:
+                name = dotted(problem.path)
+                about = "" if name == key else f"with {shown(value)}, {name}: "
+                self._refuse(("space", key), about, problem.message)
         return None
 
-    def _refuse(self, key: str, about: str, said: str) -> None:
-        at = ("space", key)
+    def _read(self, key: str, values: Mapping[str, Value]) -> Any:
+        """What the settings make of a key's value, None where it is no key any more.
+
+        Raises:
+            SettingsError: they refuse the values.
+        """
+        found: Any = resolved(self._run(values))
+        try:
+            for step in key.split("."):
+                found = found[int(step) if isinstance(found, list) else step]
+        except KeyError:
+            self._refuse(("space", key), "", "has another name now, or is no setting any more")
+            return None
+        return found
+
+    def _run(self, values: Mapping[str, Value]) -> RunSettings:
+        trial = deepcopy(self._common)
+        for key, value in values.items():
+            trial.set(key, value, "")
+        return load_run_document(trial, [], self._registries)
+
+    def _refuse(self, at: KeyPath, about: str, said: str) -> None:
         problem = Problem(self._sweep_file.where(at), at, about + said)
         if problem not in self.problems:  # as both ends of an unknown key are
             self.problems.append(problem)

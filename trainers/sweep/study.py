@@ -6,6 +6,7 @@ import time
 import zlib
 from collections.abc import Callable, Mapping
 from functools import partial
+from json import JSONDecodeError
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,7 @@ from optuna.distributions import (
 from optuna.exceptions import StorageInternalError
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner
 from optuna.samplers import BaseSampler, RandomSampler, TPESampler
-from optuna.storages import BaseStorage, JournalStorage, RDBStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages import BaseStorage, RDBStorage
 from optuna.trial import FrozenTrial
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
@@ -28,9 +28,10 @@ from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 from trainers.common.errors import UserError, first_lines
 from trainers.runfile.changes import differences
 from trainers.runfile.yaml_document import dotted
+from trainers.sweep.journal import open_journal
 from trainers.sweep.plan import Range, Sweep, Value
 
-STORAGE_ERRORS = (StorageInternalError, SQLAlchemyError)
+STORAGE_ERRORS = (StorageInternalError, SQLAlchemyError, JSONDecodeError)
 """What is raised where a storage that could be reached can no longer be."""
 DEFINITION = "sweep"
 DATABASE_TRIES, DATABASE_PAUSE_S = 4, 0.5
@@ -90,13 +91,7 @@ def shown_storage(storage: str) -> str:
 
 
 def _storage(storage: str) -> BaseStorage:
-    if "://" in storage:
-        return _database(storage)
-    # Its lock is a link to it, of which Optuna asks how old it is: one that a killed process left
-    # behind is only ever taken over if the link leads somewhere from its own folder, too.
-    path = Path(storage).absolute()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return JournalStorage(JournalFileBackend(str(path)))
+    return _database(storage) if "://" in storage else open_journal(Path(storage))
 
 
 def _database(url: str) -> RDBStorage:

@@ -113,6 +113,33 @@ def test_what_settings_refuse_together_names_the_value(
         load_sweep(path, known)
 
 
+BUFFER = "trainer.hyperparameters.buffer_size"
+
+
+def test_a_grid_is_refused_with_the_cells_that_settings_refuse(
+    sweep_file: Callable[..., Path], known: Registries
+) -> None:
+    space = {BUFFER: {"choice": [64, 256]}, BATCH: {"choice": [32, 128]}}
+    path = sweep_file(sampler="grid", space=space)
+    with pytest.raises(SettingsError) as caught:
+        load_sweep(path, known)
+    (said,) = str(caught.value).splitlines()
+    assert f"space: {BUFFER} 64, {BATCH} 128: trainer.hyperparameters: batch_size 128" in said
+    # Drawn at random such a trial may come, and breaks alone.
+    assert load_sweep(sweep_file(sampler="random", space=space), known).cells
+
+
+def test_a_value_that_goes_with_others_than_the_base_has_is_right(
+    sweep_file: Callable[..., Path], known: Registries
+) -> None:
+    """The base's batches are larger than these buffers."""
+    space = {BUFFER: {"choice": [8, 16]}, BATCH: {"choice": [4, 8]}}
+    for sampler in ("grid", "tpe"):
+        assert len(load_sweep(sweep_file(sampler=sampler, space=space), known).cells) == 4
+    with pytest.raises(SettingsError, match=re.escape(f"space.{BUFFER}: with 2, trainer")):
+        load_sweep(sweep_file(space={BUFFER: {"choice": [2, 8]}, BATCH: {"choice": [4]}}), known)
+
+
 def test_a_setting_of_before_is_no_key(sweep_file: Callable[..., Path], known: Registries) -> None:
     path = sweep_file(
         run=str(CONFIG / "quick.yaml"),

@@ -75,6 +75,24 @@ def test_the_journals_lock_leads_to_it_from_its_own_folder(
     assert all(made)
 
 
+def test_half_a_line_that_a_killed_process_left_is_cut_off(
+    sweep_file: Callable[..., Path],
+    known: Registries,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    sweep, path = load_sweep(sweep_file(sampler="random"), known), tmp_path / "a" / "journal"
+    first = params_of(sweep, path, 3)
+    whole = path.read_bytes()
+    path.write_bytes(whole + b'{"op_code": 6, "worker')
+    second = params_of(sweep, path, 2)
+    assert f"{path}: the last line was not written to its end, and is left out" in caplog.text
+    assert path.read_bytes().startswith(whole + b'{"op_code":')
+    trials = open_study(sweep, str(path)).trials
+    assert [trial.params for trial in trials] == first + second
+    assert not list(path.parent.glob("*.lock"))
+
+
 def test_a_database_whose_tables_another_process_makes_just_then_is_asked_again(
     sweep_file: Callable[..., Path],
     known: Registries,
