@@ -1,12 +1,12 @@
 """What ranks cost each other: the same work a rank on 1, 2, 4 and 8 of torchrun's processes.
 
-    python -m benchmarks.ranks [config/paper/stream.yaml] [--page docs/scale.md]
+    python -m benchmarks.ranks [benchmarks/ranks/stream.yaml] [--page docs/scale.md]
 
-Each rank has one thread, and of config/paper/frame_grab.yaml, or of another run file of PPO, 64
-environments and 256 transitions of a minibatch, so that k ranks do k times what one does. In turn
-with updates that they make together, they make each its own, and tell each other nothing: what they
-cost each other by sharing a machine. A model of an update's time is fitted to it, and says what
-more ranks would take.
+Each rank has one thread, and of frame_grab.yaml beside this file, or of another run file of PPO,
+64 environments and 256 transitions of a minibatch, so that k ranks do k times what one does. In
+turn with updates that they make together, they make each its own, and tell each other nothing: what
+they cost each other by sharing a machine. A model of an update's time is fitted to it, and says
+what more ranks would take.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from trainers.common.command import tells_failures
 from trainers.common.cores import usable_cores
 from trainers.comparison.tables import markdown
 
-RUN_FILE = ROOT / "config" / "paper" / "frame_grab.yaml"
+RUN_FILE = Path(__file__).parent / "frame_grab.yaml"
 COUNTS = (1, 2, 4, 8)
 PREDICTED = (64, 1_024)
 NETWORKS = (

@@ -111,9 +111,9 @@ def test_a_line_that_neither_falls_nor_begins_below_zero_fits_best(
     assert _line([2, 4, 8], seconds) == pytest.approx(line, abs=0.02)
 
 
-@pytest.mark.parametrize("name", ["gymnasium/pendulum_ppo", "paper/frame_grab"])
+@pytest.mark.parametrize("name", ["config/gymnasium/pendulum_ppo", "benchmarks/ranks/stream"])
 def test_run_files_of_any_environment_can_be_measured(name: str) -> None:
-    run = of_ranks(ROOT / f"config/{name}.yaml", load_registries(), 2)
+    run = of_ranks(ROOT / f"{name}.yaml", load_registries(), 2)
     assert getattr(run.environment.settings, "workers", 1) == 1
 
 
