@@ -78,7 +78,7 @@ def test_it_has_the_run_files_and_the_policies(wheel: Path) -> None:
 def test_init_finds_them_there(ventosa: Callable[..., str]) -> None:
     assert ventosa("--version") == f"ventosa {version('ventosa')}\n"
     assert "policies/grasp_gaussian" in ventosa("init")
-    copied = "paper/lstm.yaml\npaper/curriculum.yaml\nschema.json\n"
+    copied = "paper/lstm.yaml\npaper/stream.yaml\nschema.json\n"
     assert ventosa("init", "paper/lstm") == copied
 
 

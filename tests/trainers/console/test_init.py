@@ -41,7 +41,7 @@ def test_a_run_file_comes_with_those_it_extends(
     here: Path, capsys: pytest.CaptureFixture[str], registries: Registries
 ) -> None:
     assert main(["paper/lstm", "mine"]) == DONE
-    names = ("paper/lstm.yaml", "paper/curriculum.yaml", "schema.json")
+    names = ("paper/lstm.yaml", "paper/stream.yaml", "schema.json")
     assert capsys.readouterr().out == "".join(f"mine/{name}\n" for name in names)
     config = HOME / "config"
     assert files(here) == {f"mine/{name}": (config / name).read_bytes() for name in names}
