@@ -20,12 +20,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse_options(arguments)
     require_extra("render", "matplotlib")
     # Imported late, so that `--help` answers at once.
-    from trainers.comparison.planning import collect, jobs_of, plan  # noqa: PLC0415
+    from trainers.comparison.planning import collect, jobs_of, plan, runs_in  # noqa: PLC0415
     from trainers.comparison.report import write_report  # noqa: PLC0415
     from trainers.runfile.registry import load_registries  # noqa: PLC0415
-    from trainers.saving.run_folder import CONFIGURATION  # noqa: PLC0415
 
-    made = [path for path in options.paths if (path / CONFIGURATION).is_file()]
+    made = {path: runs for path in options.paths if (runs := runs_in(path))}
     planned = list(plan(options, [path for path in options.paths if path not in made]))
     registries = load_registries()
     # All run files are looked at before the first run begins.
@@ -33,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with stop_on_signals() as stop:
         try:
             code = run_missing(jobs, options.jobs, stop.requested)
-            experiments = collect(planned, made)
+            experiments = collect(planned, [run for runs in made.values() for run in runs])
             page = write_report(experiments, options.report or options.results_dir)
         except OSError as error:
             raise UserError(f"{error.filename}: can't be written: {error.strerror}") from error
@@ -57,7 +56,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         nargs="+",
         type=Path,
         metavar="CONFIG_OR_FOLDER",
-        help="run files, folders of them, or the folders of runs made elsewhere",
+        help="run files, folders of them, or runs made elsewhere and folders of those",
     )
     parser.add_argument("--seeds", type=positive, default=3, help="runs of each run file")
     parser.add_argument("--max-steps", type=positive, help="overrides trainer.max_steps")

@@ -85,6 +85,15 @@ def test_what_is_damaged_or_missing_is_told_of_beside_the_others(
     assert status.read_bytes() == damaged
 
 
+def test_a_folder_of_runs_stands_for_its_runs(
+    config: Path, tmp_path: Path, learn: Callable[..., Any]
+) -> None:
+    for seed in (0, 1):
+        learn(config, f"seed={seed}", "--run-id", f"pole-{seed}", results_dir=tmp_path / "runs")
+    assert main([str(tmp_path / "runs"), "--report", str(tmp_path)]) == DONE
+    assert "| pole | 2 | 128 |" in (tmp_path / "report.md").read_text()
+
+
 def test_runs_of_one_seed_are_not_one_experiment(
     config: Path, tmp_path: Path, learn: Callable[..., Any]
 ) -> None:

@@ -80,6 +80,13 @@ def plan(options: argparse.Namespace, paths: Sequence[Path]) -> Iterator[Planned
             yield PlannedRun(stem, config, [*overrides, f"seed={seed}"], folder)
 
 
+def runs_in(path: Path) -> list[Path]:
+    """A run's folder itself, or those of the runs in a folder; none where it is neither."""
+    if (path / CONFIGURATION).is_file():
+        return [path]
+    return sorted(file.parent for file in path.glob(f"*/{CONFIGURATION}"))
+
+
 def _run_files(paths: Sequence[Path]) -> Iterator[Path]:
     for path in paths:
         if not path.is_dir():
