@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 PERCENT = "%"
+Use = Literal["refuse", "learn", "measure"]
 
 
 @dataclass(frozen=True)
@@ -80,13 +81,19 @@ class Unanswerable:
     Attributes:
         kind: what is the matter with them.
         observations: arrays (n, ...) by name; those that only a critic sees are left out.
-        is_foreseen: whether policies may learn from them to be unsure. The others tell what happens
-            before what nobody thought of.
+        use: `refuse`: policies learn from them to be unsure, and what is sure is chosen so that
+            next to none of them is; `learn`: they learn from them, and that is all, because some
+            are nearly what can be answered; `measure`: they tell what happens before what nobody
+            thought of.
     """
 
     kind: str
     observations: Mapping[str, NDArray[Any]]
-    is_foreseen: bool = True
+    use: Use = "refuse"
+
+    def __post_init__(self) -> None:
+        if self.use not in get_args(Use):
+            raise ValueError(f"{self.kind}: use {self.use!r} is none of {', '.join(get_args(Use))}")
 
 
 class PhysicalCheck(Protocol):

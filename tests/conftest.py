@@ -30,6 +30,7 @@ from envs.evaluation import (
     PhysicalCheckOption,
     RunFileOption,
     Unanswerable,
+    Use,
     error,
     rate,
 )
@@ -215,9 +216,14 @@ class DartsEvaluator(Evaluator):
 
     def unanswerable(self, count: int, seed: int) -> Iterator[Unanswerable]:
         rng = np.random.default_rng(seed)
-        for kind, is_foreseen in (("off the board", True), ("elsewhere", False)):
+        uses: tuple[tuple[str, Use], ...] = (
+            ("off the board", "refuse"),
+            ("on the wall", "learn"),
+            ("elsewhere", "measure"),
+        )
+        for kind, use in uses:
             goal = rng.uniform(5.0, 9.0, (count, 2)) * rng.choice([-1.0, 1.0], (count, 2))
-            yield Unanswerable(kind, {"goal": goal.astype(np.float32)}, is_foreseen)
+            yield Unanswerable(kind, {"goal": goal.astype(np.float32)}, use)
 
     def physical_check(self, *, window: bool = False) -> Throw:
         if window:

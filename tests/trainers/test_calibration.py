@@ -70,7 +70,9 @@ def test_a_policy_knows_when_it_hits(
     assert calibrate(results, "--episodes", "8000") == DONE
     said = capfd.readouterr().out
     assert "right is at most: distance 70.00 cm" in said
-    assert "  elsewhere: sure 0 of 400\n" in said
+    assert "  elsewhere: sure 0 of 800\n" in said
+    assert "  off the board: sure 0 of 120\n" in said
+    assert "  on the wall: 0.00% of 120 right; sure " in said  # learned from, and not refused
     assert "  one throw: " in said
     assert "  no throw: " not in said
     assert "no throw: left out, for it can't be had here: nobody may throw" in caplog.text

@@ -42,6 +42,7 @@ from trainers.inference.confidence_fit import (
     joined,
     ordinary_distance,
     rescale,
+    without_mistakes,
 )
 from trainers.inference.onnx_policy import is_onnx
 from trainers.inference.policy import Policy
@@ -61,7 +62,7 @@ LEAST_EPISODES = 100
 SHARES = (0.55, 0.30)
 """Of the episodes: to fit in, and to choose the threshold in; the rest is to measure in."""
 AS_TRAINED = "as trained"
-EPISODES_PER_UNANSWERABLE = 20
+EPISODES_PER_UNANSWERABLE = 10
 """There is one observation of each kind that can't be answered for so many episodes."""
 EPISODES_PER_HARDER = 20
 """There is one episode of each harder task for so many of the ordinary."""
@@ -124,12 +125,14 @@ def calibrate(
             overrides=tuple(overrides),
         )
         trained = _examples(card, features, metrics)
-        foreseen, unforeseen = _unanswered(
+        unanswered = _unanswered(
             policy, env, episodes // EPISODES_PER_UNANSWERABLE, seed, len(card.estimated)
         )
     promised = _task(policy, promised_run, card, episodes - fitted, purpose=1)
-    harder = dict(_harder(policy, run, card))
-    confidence = learned(card, trained, promised, harder, foreseen, unforeseen)
+    harder = {**dict(_harder(policy, run, card)), **unanswered["learn"]}
+    confidence = learned(
+        card, trained, promised, harder, unanswered["refuse"], unanswered["measure"]
+    )
     try:
         write_atomically(folder / FILE, to_bytes(confidence))
     except OSError as error:
@@ -146,7 +149,7 @@ def learned(
     trained: Examples,
     promised: Examples,
     harder: Kinds,
-    foreseen: Kinds,
+    refused: Kinds,
     unforeseen: Kinds,
 ) -> Confidence:
     """A confidence that was fitted, given its threshold, and measured, each in a part of its own.
@@ -155,27 +158,30 @@ def learned(
         card: what is known before.
         trained: of the task that the policy was trained for, to fit with.
         promised: of the task that the promise is of, to choose the threshold with and to measure.
-        harder: of others.
-        foreseen: before what can't be answered.
+        harder: of others, to fit with, too.
+        refused: before what can't be answered, of which next to none is to be called sure.
         unforeseen: the same, left for the measuring.
     """
     confidence, choosing = Confidence(card), int(len(promised) * SHARES[1] / (1.0 - SHARES[0]))
     chosen, kept = promised[:choosing], promised[choosing:]
-    others = [each[_parts(each)[0]] for each in (*harder.values(), *foreseen.values())]
+    others = [each[_parts(each)[0]] for each in (*harder.values(), *refused.values())]
     fit(confidence, trained, joined([chosen[:0], *others]), card.seed)
     rescale(confidence, chosen)
-    refused = joined([chosen[:0], *(each[_parts(each)[1]] for each in foreseen.values())])
     with torch.no_grad():
+        never = [
+            without_mistakes(confidence(each[_parts(each)[1]].features).probability.numpy())
+            for each in refused.values()
+        ]
         far = ordinary_distance(confidence.distance(chosen.features))
         confidence.card = card.model_copy(update={"farthest": far})
         threshold = choose_threshold(
             confidence(chosen.features).probability.numpy(),
             chosen.right.numpy(),
-            confidence(refused.features).probability.numpy(),
+            np.concatenate([[], *never]),
             card.target,
         )
     confidence.card = confidence.card.model_copy(update={"threshold": threshold})
-    rest = {kind: each[_parts(each)[2]] for kind, each in foreseen.items()}
+    rest = {kind: each[_parts(each)[2]] for kind, each in refused.items()}
     measured = Measured(
         ordinary=_counts(confidence, kept),
         harder={what: _counts(confidence, each[_parts(each)[2]]) for what, each in harder.items()},
@@ -259,21 +265,20 @@ def _answered(policy: Policy, env: Environment, episodes: int, seed: int) -> tup
 
 def _unanswered(
     policy: Policy, env: Environment, count: int, seed: int, errors: int
-) -> tuple[Kinds, Kinds]:
-    """Examples of what can't be answered, so many of each kind: foreseen, and not."""
-    foreseen: dict[str, list[Examples]] = {}
-    unforeseen: dict[str, list[Examples]] = {}
+) -> dict[str, Kinds]:
+    """Examples of what can't be answered, so many of each kind, by their use."""
+    found: dict[str, dict[str, list[Examples]]] = {"refuse": {}, "learn": {}, "measure": {}}
     batch = min(count, env.num_envs)
     for first in range(0, count, batch):
         batch_seed = FIRST_SEED + seed + 3 * SEEDS_PER_PURPOSE + first * SEEDS_PER_BATCH
         for each in env.evaluator().unanswerable(batch, batch_seed):
             _, features = policy.first_actions(each.observations)
-            kinds = foreseen if each.is_foreseen else unforeseen
-            kinds.setdefault(each.kind, []).append(Examples.unanswerable(features, errors))
-    return (
-        {kind: joined(parts)[:count] for kind, parts in foreseen.items()},
-        {kind: joined(parts)[:count] for kind, parts in unforeseen.items()},
-    )
+            examples = Examples.unanswerable(features, errors)
+            found[each.use].setdefault(each.kind, []).append(examples)
+    return {
+        use: {kind: joined(parts)[:count] for kind, parts in kinds.items()}
+        for use, kinds in found.items()
+    }
 
 
 def _examples(card: Card, features: Tensor, metrics: Metrics) -> Examples:

@@ -29,6 +29,8 @@ LEAST_STD = 1e-3
 ORDINARY = 0.999
 """Share of ordinary observations whose distance is ordinary."""
 LEAST_COVERAGE = 0.25
+MISTAKEN = 0.002
+"""Share of each kind of what can't be answered that is surely more than what is called sure."""
 ONE_SIDED_99 = 2.326
 """Standard deviations of a normal distribution below which 99 % of it lie."""
 
@@ -155,6 +157,21 @@ def wilson_lower(right: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[
     z2, share = ONE_SIDED_99**2, right / count
     spread = ONE_SIDED_99 * np.sqrt(share * (1.0 - share) / count + z2 / (4.0 * count**2))
     return np.asarray((share + z2 / (2.0 * count) - spread) / (1.0 + z2 / count))
+
+
+def without_mistakes(
+    unanswerable: NDArray[np.floating], share: float = MISTAKEN
+) -> NDArray[np.floating]:
+    """Probabilities (m,) without the highest k, where k of m surely are a smaller share than that.
+
+    By the highest of all the threshold would depend on how many were looked at: among enough of
+    them there is one that nobody could tell. Of too few to say so none is left out.
+    """
+    count = np.full(len(unanswerable), len(unanswerable))
+    wrong = np.arange(len(unanswerable))
+    upper = 1.0 - wilson_lower(count - wrong, count)
+    left_out = max(int((upper < share).sum()) - 1, 0)
+    return np.sort(unanswerable)[: len(unanswerable) - left_out]
 
 
 def choose_threshold(

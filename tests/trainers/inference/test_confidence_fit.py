@@ -22,6 +22,7 @@ from trainers.inference.confidence_fit import (
     ordinary_distance,
     rescale,
     wilson_lower,
+    without_mistakes,
 )
 
 LIMIT = 0.02
@@ -159,6 +160,21 @@ def test_bounds_are_wilsons() -> None:
         exact = binomtest(right, count).proportion_ci(0.98, method="wilson")
         told = wilson_lower(np.array([right]), np.array([count]))
         np.testing.assert_allclose(told, [exact.low], atol=1e-4)
+
+
+def test_as_many_mistakes_are_left_out_as_are_surely_a_small_share() -> None:
+    """By scipy's bounds: one more would not be surely under one in 500."""
+    rng = np.random.default_rng(0)
+    for count in (0, 1, 100, 2000, 6000, 40_000):
+        told = rng.random(count)
+        left = without_mistakes(told, 0.002)
+        out = count - len(left)
+        np.testing.assert_array_equal(left, np.sort(told)[: len(left)])
+        if out:
+            assert binomtest(out, count).proportion_ci(0.98, method="wilson").high < 0.002
+        if count:
+            assert binomtest(out + 1, count).proportion_ci(0.98, method="wilson").high >= 0.002
+        assert (out > 0) == (count >= 6000)
 
 
 def test_the_promise_is_kept_in_most_worlds() -> None:
