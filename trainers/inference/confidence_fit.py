@@ -30,7 +30,7 @@ ORDINARY = 0.999
 """Share of ordinary observations whose distance is ordinary."""
 LEAST_COVERAGE = 0.25
 MISTAKEN = 0.002
-"""Share of each kind of what can't be answered that is surely more than what is called sure."""
+"""Of each kind of what can't be answered, what is called sure is surely a smaller share."""
 ONE_SIDED_99 = 2.326
 """Standard deviations of a normal distribution below which 99 % of it lie."""
 

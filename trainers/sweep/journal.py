@@ -9,6 +9,8 @@ from pathlib import Path
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
 
+BEGINNING = b'{"op_code":'
+"""Of each line of Optuna's."""
 _logger = logging.getLogger("ventosa")
 
 
@@ -38,7 +40,7 @@ def open_journal(path: Path) -> JournalStorage:
 def _cut_half_a_line(path: Path) -> None:
     content = path.read_bytes()
     whole = content.rfind(b"\n") + 1
-    if whole < len(content):
+    if content.startswith(BEGINNING) and whole < len(content):  # no file of another kind
         _logger.warning(
             "%s: the last line was not written to its end, and is left out: %r",
             path,

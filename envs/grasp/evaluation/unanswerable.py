@@ -85,7 +85,7 @@ def _images(
     yield Unanswerable("planes", drawn(_nearest_planes))
     yield Unanswerable("nothing seen", {k: np.zeros_like(v) for k, v in ordinary.items()})
     yield Unanswerable("noise", drawn(_noise))
-    # The least of these look nearly as right as a camera's own faults: no threshold tells all.
+    # Those that are least wrong look much like what can be answered: they set no threshold.
     yield Unanswerable("another unit", _scaled(rng, ordinary), use="learn")
     unforeseen = partial(Unanswerable, use="measure")
     yield unforeseen("a corner", drawn(_farthest_planes))

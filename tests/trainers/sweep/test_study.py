@@ -93,6 +93,16 @@ def test_half_a_line_that_a_killed_process_left_is_cut_off(
     assert not list(path.parent.glob("*.lock"))
 
 
+def test_a_file_that_is_no_journal_is_refused_as_it_is(
+    sweep_file: Callable[..., Path], known: Registries, tmp_path: Path
+) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("mine\nthe last line has no end")
+    with pytest.raises(UserError, match=r"notes.txt: can't be used: "):
+        open_study(load_sweep(sweep_file(), known), str(path))
+    assert path.read_text() == "mine\nthe last line has no end"
+
+
 def test_a_database_whose_tables_another_process_makes_just_then_is_asked_again(
     sweep_file: Callable[..., Path],
     known: Registries,
