@@ -95,10 +95,14 @@ def spread(values: Sequence[float], unit: str = "") -> str:
     """The median, with the lowest and the highest; empty where there are no values."""
     if not values:
         return ""
-    middle = f"{statistics.median(values):.3g}{unit}"
+    middle = f"{_shown(statistics.median(values))}{unit}"
     if len(values) == 1:
         return middle
-    return f"{middle} ({min(values):.3g} to {max(values):.3g})"
+    return f"{middle} ({_shown(min(values))} to {_shown(max(values))})"
+
+
+def _shown(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
 
 
 def draw(experiments: Experiments, files: Sequence[Path]) -> None:
@@ -180,4 +184,4 @@ def _of_evaluation(runs: Sequence[RunResult], key: str) -> str:
     values = {part: [value[part] for value in found if part in value] for part in parts}
     if "" in values:
         return spread(values[""])
-    return " / ".join(f"{statistics.median(numbers):.3g}" for numbers in values.values())
+    return " / ".join(_shown(statistics.median(numbers)) for numbers in values.values())

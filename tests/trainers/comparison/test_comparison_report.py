@@ -43,6 +43,11 @@ def test_a_row_by_hand() -> None:
     ]
 
 
+def test_large_numbers_are_written_out() -> None:
+    assert report.spread([-1234.5, -1000.25, 999.6]) == "-1,000 (-1,234 to 1,000)"
+    assert report.spread([12.345]) == "12.3"
+
+
 def test_what_broke_is_in_the_row_with_its_reason() -> None:
     broken = run(0, state="failed", reason="NaN in the loss")
     cells = report.row("mine", [broken, run(1, 2.0)])
