@@ -89,8 +89,8 @@ class RunResult:
         Event files that were cut short, or are missing, tell less than `status.json` does.
         """
         steps = np.unique(np.concatenate([NOTHING[0], *(c[0] for c in self.curves.values())]))
-        last, gap = (int(steps[-1]), np.diff(steps, prepend=0).max()) if len(steps) else (0, 0)
-        return last if self.step - last > 2 * gap else None
+        last, interval = (int(steps[-1]), np.diff(steps, prepend=0).max()) if len(steps) else (0, 0)
+        return last if self.step - last > 2 * interval else None
 
     @property
     def seconds(self) -> float:

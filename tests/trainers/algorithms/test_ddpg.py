@@ -573,7 +573,8 @@ def test_a_run_resumed_without_its_buffer_fills_it_with_its_policy_first(
     one_round(other)
     assert not changed(before, other.policy.online.parameters())
     goal = other._buffer.observations(np.arange(16), ["goal"])
-    assert torch.equal(other.policy.online.act(goal), other._buffer.actions(np.arange(16)))
+    # Fewer rows at a time than here may be rounded otherwise, depending on the processor.
+    torch.testing.assert_close(other.policy.online.act(goal), other._buffer.actions(np.arange(16)))
     one_round(other)
     assert changed(before, other.policy.online.parameters())
 
