@@ -78,13 +78,15 @@ def lines(experiments: Experiments) -> Iterator[str]:
 
 def row(name: str, runs: Sequence[RunResult]) -> list[str]:
     """The cells of an experiment, as `HEAD` names them."""
+    rewards = [run.reward[1] for run in runs if len(run.reward[1])]
+    successes = [run.status["success"] for run in runs if run.status.get("success") is not None]
     return [
         name,
         str(len(runs)),
         f"{statistics.median(run.step for run in runs):,.0f}",
-        spread([run.reward[1][-1] for run in runs if len(run.reward[1])]),
-        spread([run.reward[1].max() for run in runs if len(run.reward[1])]),
-        spread([100.0 * value for run in runs if (value := _success(run)) is not None], " %"),
+        spread([values[-1] for values in rewards]),
+        spread([values.max() for values in rewards]),
+        spread([100.0 * success for success in successes], " %"),
         _lessons(runs),
         f"{statistics.median(run.seconds for run in runs) / 3600.0:.2f}",
         ", ".join(dict.fromkeys(_ended(run) for run in runs)),
@@ -141,11 +143,6 @@ def common_curves(curves: Sequence[Curve]) -> tuple[NDArray[np.float64], NDArray
     )
     is_any = np.isfinite(found).any(axis=0)
     return steps[is_any], found[:, is_any]
-
-
-def _success(run: RunResult) -> float | None:
-    value: float | None = run.status.get("success")
-    return value
 
 
 def _lessons(runs: Sequence[RunResult]) -> str:

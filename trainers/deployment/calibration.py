@@ -7,13 +7,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from envs.environment import Environment
-from envs.evaluation import right_answers
+from envs.evaluation import Use, right_answers
 from trainers.common.errors import UserError, suggestion
 from trainers.common.files import write_atomically
 from trainers.evaluation import (
@@ -267,7 +268,7 @@ def _unanswered(
     policy: Policy, env: Environment, count: int, seed: int, errors: int
 ) -> dict[str, Kinds]:
     """Examples of what can't be answered, so many of each kind, by their use."""
-    found: dict[str, dict[str, list[Examples]]] = {"refuse": {}, "learn": {}, "measure": {}}
+    found: dict[str, dict[str, list[Examples]]] = {use: {} for use in get_args(Use)}
     batch = min(count, env.num_envs)
     for first in range(0, count, batch):
         batch_seed = FIRST_SEED + seed + 3 * SEEDS_PER_PURPOSE + first * SEEDS_PER_BATCH
