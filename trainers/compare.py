@@ -60,6 +60,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--seeds", type=positive, default=3, help="runs of each run file")
     parser.add_argument("--max-steps", type=positive, help="overrides trainer.max_steps")
+    parser.add_argument("--device", help="overrides `device`, such as cpu or cuda")
     parser.add_argument("--jobs", type=positive, default=CORES, help="runs at a time")
     parser.add_argument("--report", type=Path, metavar="FOLDER", help="default: with the runs")
     add_results_option(parser, "results/compare")

@@ -44,6 +44,15 @@ def planned(config: Path, results: Path, **options: Any) -> list[PlannedRun]:
     return list(plan(parsed, parsed.paths))
 
 
+def test_where_a_run_was_computed_makes_it_no_other(
+    config: Path, tmp_path: Path, learn: Callable[..., Any]
+) -> None:
+    (run,) = planned(config, tmp_path, seeds=1, device="cuda")
+    assert list(run.overrides) == ["device=cuda", "seed=0"]
+    learn(config, "seed=0", "--run-id", run.folder.name, results_dir=tmp_path)
+    assert not run.job(load_registries()).missing
+
+
 def test_runs_what_is_missing_and_reports_on_all(
     config: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,6 +20,8 @@ from trainers.runfile.yaml_document import dotted, parse, read
 from trainers.saving.run_folder import CONFIGURATION, has_checkpoints
 
 FINISHED = "finished"
+DEVICE = ("device",)
+"""Where it was computed makes a run no other one; learn goes on with it on another, too."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,8 @@ class PlannedRun:
         if (self.folder / CONFIGURATION).is_file():
             found = read(self.folder / CONFIGURATION).data
             for path, _, _ in differences(found, asked):
+                if path == DEVICE:
+                    continue
                 raise UserError(
                     f"{self.folder}: what is there was made by another run file than {self.config}:"
                     f" {dotted(path)} differs; choose another --results-dir"
@@ -73,6 +77,8 @@ def plan(options: argparse.Namespace, paths: Sequence[Path]) -> Iterator[Planned
             raise UserError(f"{earlier} and {config} have the same name: rename one of them")
     steps = options.max_steps
     overrides = [] if steps is None else [f"trainer.max_steps={steps}"]
+    if options.device is not None:
+        overrides.append(f"device={options.device}")
     name = "-".join(filter(None, ("{}", steps and str(steps))))
     for stem, config in configs.items():
         for seed in range(options.seeds):

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
+import numba
+
 from trainers.common.cores import usable_cores
 
 # A part costs the call of a compiled function, some 15 us.
@@ -19,7 +21,8 @@ class ThreadPool:
     barriers of OpenMP, on machines where others compute as well.
 
     Args:
-        threads: how many, with the caller; None: one for each core that may be used.
+        threads: how many, with the caller; None: one for each core that may be used, or fewer
+            where numba's own variable `NUMBA_NUM_THREADS` says so.
 
     Raises:
         ValueError: `threads` is less than one.
@@ -28,7 +31,8 @@ class ThreadPool:
     def __init__(self, threads: int | None = None):
         if threads is not None and threads < 1:
             raise ValueError(f"{threads} threads: there must be at least 1")
-        self._threads = threads = threads or usable_cores()
+        most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # set as it is read
+        self._threads = threads = threads or min(usable_cores(), most)
         self._helpers = ThreadPoolExecutor(threads - 1) if threads > 1 else None
 
     def parallel_for(self, work: Callable[[int, int], None], rows: int) -> None:

@@ -125,3 +125,10 @@ def test_threads_and_jobs_are_as_many_as_the_affinity_has() -> None:
     )
     printed = subprocess.check_output([sys.executable, "-c", code], text=True)
     assert printed.split()[1:] == ["1", "1"]
+
+
+def test_a_job_has_one_thread_in_compiled_loops_too() -> None:
+    """`compare` and `sweep` say so by numba's variable, whatever the number of cores."""
+    code = "from envs.grasp.simulators.thread_pool import ThreadPool; print(ThreadPool()._threads)"
+    environment = os.environ | {"NUMBA_NUM_THREADS": "1"}
+    assert subprocess.check_output([sys.executable, "-c", code], env=environment) == b"1\n"
