@@ -328,8 +328,9 @@ class _Slots:
         return slots
 
     def gather(self, slots: Tensor, names: Iterable[str]) -> dict[str, Tensor]:
-        """Copies of some entries, those of `names`."""
-        return {name: gather(self._tensors[name], slots) for name in names}
+        """Copies of some entries, those of `names`; the slots may lie on the CPU."""
+        tensors = {name: self._tensors[name] for name in names}
+        return {name: gather(tensor, slots.to(tensor.device)) for name, tensor in tensors.items()}
 
     def release(self, slots: NDArray[np.int64]) -> None:
         """Gives slots back."""

@@ -22,6 +22,10 @@ from trainers.networks.observations import Observations
 from trainers.saving.serialization import flatten, unflatten
 
 CPU = torch.device("cpu")
+DEVICES = [
+    "cpu",
+    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")),
+]
 SIDE_PX = 2
 SPACE = gymnasium.spaces.Dict(
     {
@@ -66,9 +70,9 @@ def raw(seen: list[Seen]) -> dict[str, np.ndarray]:
 
 def as_seen(observations: Observations) -> list[Seen]:
     assert observations.frame_index is None
-    depth, height = observations.frames["depth"].numpy(), observations.frames["height"].numpy()
+    depth, height = (observations.frames[name].cpu().numpy() for name in ("depth", "height"))
     assert (depth == height - 7).all()
-    state = observations.vectors["state"].numpy()
+    state = observations.vectors["state"].cpu().numpy()
     assert (state[:, 0] == -state[:, 1]).all()
     return [Seen(int(p), int(s)) for p, s in zip(depth[:, 0, 0, 0], state[:, 0], strict=True)]
 
@@ -133,20 +137,22 @@ def n_step(history: list[Kept], first: int, gamma: float, steps: int) -> tuple[f
     return total, 0.0 if one.terminated else gamma**power, one
 
 
-def places_of(buffer: ReplayBuffer) -> torch.Tensor:
+def places_of(buffer: ReplayBuffer, device: torch.device = CPU) -> torch.Tensor:
     """Every place that can be drawn, found by drawing; in order of age after a full ring."""
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator(device).manual_seed(0)
     return buffer.sample((60 * len(buffer),), generator).unique()
 
 
-def check(buffer: ReplayBuffer, world: World, gamma: float, steps: int) -> None:
+def check(
+    buffer: ReplayBuffer, world: World, gamma: float, steps: int, device: torch.device = CPU
+) -> None:
     expected = {
         one.action: (history, number)
         for history in world.histories
         for number, one in enumerate(history)
     }
     assert len(buffer) == len(expected)
-    indices = places_of(buffer)
+    indices = places_of(buffer, device)
     actions = buffer.actions(indices)[:, 0].tolist()
     assert sorted(actions) == sorted(expected)
     before = as_seen(buffer.observations(indices, NAMES))
@@ -176,23 +182,25 @@ def scripts(draw: st.DrawFn) -> tuple[int, int, list[list[str]]]:
     return num_envs, steps, draw(st.lists(moment, min_size=1, max_size=25))
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @given(scripts(), st.floats(0.0, 1.0), st.integers(1, 4), st.integers(0, 25))
 def test_what_is_drawn_is_what_went_in(
-    script: tuple[int, int, list[list[str]]], gamma: float, n: int, moved_at: int
+    device: str, script: tuple[int, int, list[list[str]]], gamma: float, n: int, moved_at: int
 ) -> None:
     num_envs, steps, moments = script
     world = World(num_envs, steps)
-    buffer = ReplayBuffer(SPACE, 1, num_envs, steps * num_envs, CPU)
+    size = (num_envs, steps * num_envs, torch.device(device))
+    buffer = ReplayBuffer(SPACE, 1, *size)
     for number, events in enumerate(moments):
         if number == moved_at:  # into another buffer, which has a past of its own
             state = buffer.state_dict()
-            buffer = ReplayBuffer(SPACE, 1, num_envs, steps * num_envs, CPU)
+            buffer = ReplayBuffer(SPACE, 1, *size)
             elsewhere = World(num_envs, steps)
             for _ in range(8):  # that takes more images than most
                 elsewhere.step(buffer, ["truncated"] * num_envs)
             buffer.load_state_dict(unflatten(*flatten(state)))
         world.step(buffer, events)
-        check(buffer, world, gamma, n)
+        check(buffer, world, gamma, n, torch.device(device))
 
 
 def test_only_what_is_asked_for_is_fetched() -> None:
