@@ -52,12 +52,11 @@ class PlannedRun:
         done = False
         if (self.folder / CONFIGURATION).is_file():
             found = read(self.folder / CONFIGURATION).data
-            for path, _, _ in differences(found, asked):
-                if path == DEVICE:
-                    continue
+            changed = [path for path, _, _ in differences(found, asked) if path != DEVICE]
+            if changed:
                 raise UserError(
                     f"{self.folder}: what is there was made by another run file than {self.config}:"
-                    f" {dotted(path)} differs; choose another --results-dir"
+                    f" {dotted(changed[0])} differs; choose another --results-dir"
                 )
             done = read_status(self.folder).get("state") == FINISHED
             learn += ["--resume" if has_checkpoints(self.folder) else "--force"]
